@@ -1,0 +1,93 @@
+"""
+The Cross-Entropy Method (Algorithm 1 of the paper) and the interface that a selector of actions has.
+
+Shapes: B states, N samples per state, K elites per state, A action dimensions.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import torch as th
+
+from sb3_cgp.validation import check_cem
+
+# Scores N actions for each of B states: (B, N, A) in [-1, 1] -> (B, N), higher is better
+Score = Callable[[th.Tensor], th.Tensor]
+
+
+class Selection(NamedTuple):
+    """
+    What a selector found.
+
+    :param actions: the selected actions, (B, A), within [-1, 1]
+    :param spread: standard deviation of the final sampling distribution, (B, A), before tanh
+    """
+
+    actions: th.Tensor
+    spread: th.Tensor
+
+
+class ActionSelector(Protocol):
+    """Selects, for each of a batch of states, an action that a scoring function rates highly."""
+
+    def select(self, score: Score, n_states: int, action_dim: int, device: th.device | str = "cpu") -> Selection:
+        """
+        Select an action for each state.
+
+        :param score: scores N actions per state: (B, N, A) within [-1, 1] -> (B, N)
+        :param n_states: number of states, B
+        :param action_dim: number of action dimensions, A
+        :param device: the device on which ``score`` works
+        :return: the selected actions
+        """
+
+
+class CEM:
+    """
+    Cross-Entropy Method with independent Gaussians (Algorithm 1), squashed by tanh into the action space.
+
+    :param iterations: number of iterations N of Algorithm 1, at least 1
+    :param samples: number of samples n per state and iteration, at least 1
+    :param elites: number of winners k that the next distribution is fitted to, from 1 to ``samples``
+    :param result: "best" returns the best-scoring sample of the last iteration, as the paper does;
+        "mean" returns the mean of the last elites, which averages out the sampling
+    :raises ValueError: if an argument is out of its range
+    """
+
+    def __init__(self, iterations: int = 2, samples: int = 64, elites: int = 6, result: str = "best"):
+        check_cem(iterations, samples, elites, result)
+        self.iterations = iterations
+        self.samples = samples
+        self.elites = elites
+        self.result = result
+
+    def __repr__(self) -> str:
+        return f"CEM(iterations={self.iterations}, samples={self.samples}, elites={self.elites}, result={self.result!r})"
+
+    @th.no_grad()
+    def select(self, score: Score, n_states: int, action_dim: int, device: th.device | str = "cpu") -> Selection:
+        """
+        Maximise ``score`` for each state by Algorithm 1, drawing from PyTorch's global generator.
+
+        A sample whose score is NaN is never preferred to one whose score is not.
+
+        :param score: scores N actions per state: (B, N, A) within [-1, 1] -> (B, N)
+        :param n_states: number of states, B
+        :param action_dim: number of action dimensions, A
+        :param device: the device on which ``score`` works
+        :return: the selected actions (B, A) and the final spread (B, A)
+        """
+        mean = th.zeros(n_states, action_dim, device=device)
+        std = th.ones(n_states, action_dim, device=device)
+        best = mean
+        for _ in range(self.iterations):
+            noise = th.randn(n_states, self.samples, action_dim, device=device)
+            samples = th.addcmul(mean.unsqueeze(1), std.unsqueeze(1), noise)  # (B, N, A)
+            values = score(th.tanh(samples))  # (B, N)
+            values = values.masked_fill(values.isnan(), -th.inf)
+            winners = values.topk(self.elites, dim=1).indices  # (B, K), best first
+            elites = samples.gather(1, winners.unsqueeze(2).expand(-1, -1, action_dim))  # (B, K, A)
+            mean = elites.mean(dim=1)
+            std = elites.std(dim=1, correction=0)
+            best = elites[:, 0]
+        return Selection(actions=th.tanh(best if self.result == "best" else mean), spread=std)

@@ -1,0 +1,102 @@
+"""Off-policy algorithms whose loaded models allocate their replay buffer only when they train."""
+
+import io
+import pathlib
+from typing import Any, TypeVar
+
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+SelfDeferredBufferAlgorithm = TypeVar("SelfDeferredBufferAlgorithm", bound="DeferredBufferAlgorithm")
+
+
+class DeferredBufferAlgorithm(OffPolicyAlgorithm):
+    """
+    SB3's off-policy algorithm, save that a model which is loaded to be watched takes no memory for a million transitions.
+
+    rl_zoo3's ``enjoy`` and ``record_video`` see to that themselves, but only for a fixed list of algorithms.
+    """
+
+    # Set by `load`, before the model is built
+    _replay_buffer_deferred: bool = False
+
+    def _setup_model(self) -> None:
+        buffer_size = self.buffer_size
+        if self._replay_buffer_deferred:
+            # SB3 allocates the buffer here: one row, until training asks for the others
+            self.buffer_size = 1
+        super()._setup_model()
+        if self._replay_buffer_deferred:
+            self.buffer_size, self.replay_buffer = buffer_size, None
+
+    def _ensure_replay_buffer(self) -> ReplayBuffer:
+        """
+        Allocate the replay buffer that ``load`` left out, as SB3 does it.
+
+        :return: the replay buffer
+        """
+        if self.replay_buffer is None:
+            assert self.replay_buffer_class is not None
+            kwargs = self.replay_buffer_kwargs.copy()
+            if issubclass(self.replay_buffer_class, HerReplayBuffer):
+                kwargs["env"] = self.env
+            self.replay_buffer = self.replay_buffer_class(
+                self.buffer_size,
+                self.observation_space,
+                self.action_space,
+                device=self.device,
+                n_envs=self.n_envs,
+                optimize_memory_usage=self.optimize_memory_usage,
+                **kwargs,
+            )
+        return self.replay_buffer
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
+        self._ensure_replay_buffer()
+        return super()._setup_learn(*args, **kwargs)
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        Save the replay buffer as a pickle file.
+
+        :param path: Path to the file where the replay buffer should be saved.
+            if path is a str or pathlib.Path, the path is automatically created if necessary.
+        """
+        self._ensure_replay_buffer()
+        super().save_replay_buffer(path)
+
+    @classmethod
+    def load(
+        cls: type[SelfDeferredBufferAlgorithm],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfDeferredBufferAlgorithm:
+        """
+        Load the model from a zip-file, as SB3 does.
+
+        Its replay buffer is None until ``learn`` allocates it or ``load_replay_buffer`` loads one.
+
+        :param path: path to the file (or a file-like) where to load the agent from
+        :param env: the new environment to run the loaded model on
+            (can be None if you only need prediction from a trained model) has priority over any saved environment
+        :param device: Device on which the code should run.
+        :param custom_objects: Dictionary of objects to replace upon loading.
+        :param print_system_info: Whether to print system info from the saved model and the current system info
+        :param force_reset: Force call to ``reset()`` before training to avoid unexpected behavior.
+        :param kwargs: arguments to change in the model when loading, such as ``cem_iterations=4``
+        :return: new model instance with loaded parameters
+        :raises ValueError: if a changed argument is out of its range or contradicts another one
+        """
+        kwargs["_replay_buffer_deferred"] = True
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_replay_buffer_deferred"]

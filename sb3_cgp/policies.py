@@ -1,0 +1,193 @@
+"""The policies of CGP: TD3's networks, an action selector, and the choice of which of them acts."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.td3.policies import TD3Policy
+from torch import nn
+
+from sb3_cgp.cem import CEM, ActionSelector, Selection
+from sb3_cgp.scoring import q_score
+from sb3_cgp.validation import INFERENCES, require_choice
+
+
+class CGPPolicy(TD3Policy):
+    """
+    Policy class of CGP for vector observations: an action selector, an actor, critics, and their averages.
+
+    The averaged actor φ' of Algorithm 2 is ``actor_target``, the target critics θ' are ``critic_target``.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
+    :param net_arch: The specification of the policy and value networks, two hidden layers of 256 units by default.
+    :param activation_fn: Activation function
+    :param features_extractor_class: Features extractor to use.
+    :param features_extractor_kwargs: Keyword arguments to pass to the features extractor.
+    :param normalize_images: Whether to normalize images or not, dividing by 255.0 (True by default)
+    :param optimizer_class: The optimizer to use, ``th.optim.Adam`` by default
+    :param optimizer_kwargs: Additional keyword arguments, excluding the learning rate, to pass to the optimizer
+    :param n_critics: Number of critic networks to create.
+    :param share_features_extractor: Whether to share or not the features extractor between the actor and the critic
+        (this saves computation time)
+    :param selector: Selects the actions that the critic rates highest, by default CEM with the paper's settings.
+        Another sampler only needs the method of :class:`~sb3_cgp.cem.ActionSelector`.
+    :param inference: What ``predict`` asks: the "actor", the "averaged_actor" or "cem" (the selector)
+    :raises ValueError: if ``inference`` is not one of these
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        n_critics: int = 2,
+        share_features_extractor: bool = False,
+        selector: ActionSelector | None = None,
+        inference: str = "actor",
+    ):
+        require_choice("inference", inference, INFERENCES)
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            [256, 256] if net_arch is None else net_arch,
+            activation_fn,
+            features_extractor_class,
+            features_extractor_kwargs,
+            normalize_images,
+            optimizer_class,
+            optimizer_kwargs,
+            n_critics,
+            share_features_extractor,
+        )
+        self.selector = CEM() if selector is None else selector
+        self.inference = inference
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(selector=self.selector, inference=self.inference)
+        return data
+
+    @th.no_grad()
+    def select_actions(self, observation: PyTorchObs, critic: ContinuousCritic) -> Selection:
+        """
+        Select the actions that the first network of ``critic`` rates highest (π_CEM of Algorithm 1).
+
+        Each observation passes the features extractor once. The critic works in evaluation mode, so that neither
+        dropout nor batch statistics disturb the ranking and its running statistics stay as they are.
+
+        :param observation: a batch of B observations, as tensors
+        :param critic: the critic, or the target critic
+        :return: the selected actions, (B, A), in the scaled action space, and the selector's final spread
+        """
+        with _evaluation_mode(critic):
+            features = critic.extract_features(observation, critic.features_extractor)
+            score = q_score(critic.q_networks[0], features)
+            return self.selector.select(score, len(features), get_action_dim(self.action_space), features.device)
+
+    @contextmanager
+    def inferring_by(self, inference: str) -> Iterator[None]:
+        """
+        Let ``predict`` ask another network, or the selector, for a while.
+
+        :param inference: "actor", "averaged_actor" or "cem"
+        """
+        usual, self.inference = self.inference, inference
+        try:
+            yield
+        finally:
+            self.inference = usual
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        # As in TD3, `deterministic` changes nothing: the actor has no noise, and CEM always samples
+        if self.inference == "cem":
+            return self.select_actions(observation, self.critic).actions
+        actor = self.actor_target if self.inference == "averaged_actor" else self.actor
+        return actor(observation)
+
+
+@contextmanager
+def _evaluation_mode(network: nn.Module) -> Iterator[None]:
+    """Put a network in evaluation mode for a while."""
+    was_training = network.training
+    if was_training:
+        network.eval()
+    try:
+        yield
+    finally:
+        if was_training:
+            network.train()
+
+
+MlpPolicy = CGPPolicy
+
+
+class CnnPolicy(CGPPolicy):
+    """
+    Policy class of CGP for images.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
+    :param net_arch: The specification of the policy and value networks, two hidden layers of 256 units by default.
+    :param activation_fn: Activation function
+    :param features_extractor_class: Features extractor to use.
+    :param kwargs: the further arguments of :class:`CGPPolicy`
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            observation_space, action_space, lr_schedule, net_arch, activation_fn, features_extractor_class, **kwargs
+        )
+
+
+class MultiInputPolicy(CGPPolicy):
+    """
+    Policy class of CGP for ``Dict`` observation spaces.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
+    :param net_arch: The specification of the policy and value networks, two hidden layers of 256 units by default.
+    :param activation_fn: Activation function
+    :param features_extractor_class: Features extractor to use.
+    :param kwargs: the further arguments of :class:`CGPPolicy`
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            observation_space, action_space, lr_schedule, net_arch, activation_fn, features_extractor_class, **kwargs
+        )

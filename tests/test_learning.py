@@ -1,0 +1,37 @@
+"""Every variant learns: the paper's five on Pendulum, and CGP on a MuJoCo task."""
+
+import argparse
+
+import pytest
+from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_cgp import zoo
+
+pytestmark = pytest.mark.slow
+
+VARIANTS = {
+    "CGP-Online": dict(policy_loss="cgp"),
+    "CGP-Offline": dict(policy_loss="cgp", policy_training="offline"),
+    "QGP-Online": dict(policy_loss="qgp"),
+    "QGP-Offline": dict(policy_loss="qgp", policy_training="offline"),
+    "CEM": dict(policy_loss=None),
+}
+
+
+def mean_return(env_id, tmp_path, **variant):
+    """Train as `rl_zoo3.train --algo cgp` does, and evaluate over 20 episodes."""
+    zoo.register()
+    manager = ExperimentManager(
+        argparse.Namespace(), "cgp", env_id, str(tmp_path), hyperparams=variant, eval_freq=-1, verbose=0, seed=0, device="cpu"
+    )
+    model, _ = manager.setup_experiment()
+    manager.learn(model)
+    return evaluate_policy(model, make_vec_env(env_id, seed=1_000), n_eval_episodes=20)[0]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_variant_swings_up_the_pendulum(variant, tmp_path):
+    # Random actions earn about -1200, the best known policies about -150
+    assert mean_return("Pendulum-v1", tmp_path, **VARIANTS[variant]) >= -200
