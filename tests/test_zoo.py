@@ -1,0 +1,207 @@
+"""CGP in rl_zoo3: registration, the YAML file, and Optuna's search space."""
+
+import argparse
+import importlib
+import inspect
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import optuna
+import pytest
+import yaml
+from gymnasium import spaces
+from optuna.distributions import CategoricalDistribution
+from optuna.trial import FixedTrial
+from rl_zoo3 import exp_manager, hyperparams_opt, utils
+from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.envs import BitFlippingEnv
+
+from sb3_cgp import CGP, zoo
+
+PAPER_TASKS = {f"{task}-v{version}" for task in ("HalfCheetah", "Humanoid", "Hopper", "Pusher", "Ant") for version in (4, 5)}
+OTHER_TASKS = {"Pendulum-v1", "MountainCarContinuous-v0"} | {
+    f"{task}-v{version}"
+    for task in ("InvertedPendulum", "InvertedDoublePendulum", "Reacher", "Swimmer", "Walker2d")
+    for version in (4, 5)
+}
+ENTRIES = yaml.safe_load((zoo.hyperparams_folder() / "cgp.yml").read_text())
+NO_HER = {"using_her_replay_buffer": False, "her_kwargs": {}}
+TINY = {"buffer_size": 100, "policy_kwargs": {"net_arch": [4]}}
+
+
+def manager(folder, algo="cgp", env_id="Pendulum-v1", **kwargs) -> ExperimentManager:
+    """What ``rl_zoo3.train`` makes of its arguments."""
+    args = argparse.Namespace()
+    return ExperimentManager(args, algo, env_id, str(folder), eval_freq=-1, verbose=0, device="cpu", **kwargs)
+
+
+def random_parameters(n_trials: int, additional_args=NO_HER) -> list[dict]:
+    """What Optuna suggests in independent trials."""
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    trials = [study.ask() for _ in range(n_trials)]
+    for trial in trials:
+        zoo.sample_cgp_params(trial, 1, 1, additional_args)
+    return [trial.params for trial in trials]
+
+
+@pytest.fixture
+def unregistered(monkeypatch):
+    """rl_zoo3 as it is without us, where the start-up hook or another test has registered CGP."""
+    zoo.register()
+    for registry in (utils.ALGOS, hyperparams_opt.HYPERPARAMS_SAMPLER, hyperparams_opt.HYPERPARAMS_CONVERTER):
+        monkeypatch.delitem(registry, "cgp")
+    monkeypatch.setattr(ExperimentManager, "__init__", ExperimentManager.__init__.__wrapped__)
+
+
+def test_register_adds_cgp_and_nothing_else(unregistered, tmp_path):
+    registries = (utils.ALGOS, hyperparams_opt.HYPERPARAMS_SAMPLER, hyperparams_opt.HYPERPARAMS_CONVERTER)
+    before = [dict(registry) for registry in registries]
+    assert not Path(manager(tmp_path).config).exists()
+
+    zoo.register()
+
+    added = [CGP, zoo.sample_cgp_params, zoo.convert_cgp_params]
+    assert [dict(registry) for registry in registries] == [old | {"cgp": new} for old, new in zip(before, added, strict=True)]
+    # Scripts hold the dictionaries by other names
+    assert exp_manager.ALGOS["cgp"] is CGP
+    assert Path(manager(tmp_path).config) == zoo.hyperparams_folder() / "cgp.yml"
+
+
+def test_register_twice_is_register_once(unregistered):
+    zoo.register()
+    initialise = ExperimentManager.__init__
+    zoo.register()
+    assert ExperimentManager.__init__ is initialise
+
+
+def test_default_config_of_other_algorithms_and_a_config_given_are_kept(tmp_path):
+    zoo.register()
+    assert Path(manager(tmp_path, "td3").config) == Path(exp_manager.__file__).parent / "hyperparams" / "td3.yml"
+    assert manager(tmp_path, config="mine.yml").config == "mine.yml"
+    positions = list(inspect.signature(ExperimentManager).parameters)
+    arguments = {"args": argparse.Namespace(), "algo": "cgp", "env_id": "Pendulum-v1", "log_folder": "", "config": "mine.yml"}
+    defaults = inspect.signature(ExperimentManager).parameters
+    positional = [arguments.get(name, defaults[name].default) for name in positions[: positions.index("config") + 1]]
+    assert ExperimentManager(*positional).config == "mine.yml"
+
+
+def test_hyperparams_folder_inside_the_package_or_beside_it(monkeypatch, tmp_path):
+    package = tmp_path / "sb3_cgp"
+    monkeypatch.setattr(zoo, "__file__", str(package / "zoo.py"))
+    with pytest.raises(FileNotFoundError, match="install sb3_cgp again"):
+        zoo.hyperparams_folder()
+    for folder in (tmp_path / "hyperparams", package / "hyperparams"):
+        folder.mkdir(parents=True)
+        (folder / "cgp.yml").touch()
+        assert zoo.hyperparams_folder() == folder
+
+
+def test_push_to_hub_starts_and_writes_a_model_card(tmp_path):
+    zoo.register()
+    push_to_hub = importlib.import_module("rl_zoo3.push_to_hub")
+    card, metadata = push_to_hub.generate_model_card("cgp", "CGP", "me", "Pendulum-v1", -150.0, 10.0, {}, {})
+    push_to_hub.save_model_card(tmp_path, card, metadata)
+    front_matter = yaml.safe_load((tmp_path / "README.md").read_text().split("---")[1])
+    assert front_matter["model-index"][0]["name"] == "CGP"
+    assert front_matter["model-index"][0]["results"][0]["metrics"][0]["value"] == "-150.00 +/- 10.00"
+
+
+def test_a_hub_library_that_is_whole_is_left_alone(monkeypatch):
+    hub = importlib.import_module("huggingface_sb3.push_to_hub")
+    theirs = object()
+    monkeypatch.setattr(hub, "generate_metadata", theirs, raising=False)
+    zoo.register()
+    assert hub.generate_metadata is theirs
+
+
+def test_the_default_entry_is_the_default_of_cgp():
+    entry = {**ENTRIES["default"]}
+    assert entry.pop("n_timesteps") == 1e6
+    assert entry.pop("policy") == "MlpPolicy"
+    assert entry.pop("policy_kwargs") == "dict(net_arch=[256, 256])"
+    assert CGP("MlpPolicy", "Pendulum-v1", buffer_size=1).policy.net_arch == [256, 256]
+    defaults = {name: parameter.default for name, parameter in inspect.signature(CGP).parameters.items()}
+    assert entry == {name: defaults[name] for name in entry}
+
+
+def test_every_task_has_its_entry_and_the_papers_tasks_its_configuration():
+    assert set(ENTRIES) == {"default"} | PAPER_TASKS | OTHER_TASKS
+    for task in PAPER_TASKS:
+        assert ENTRIES[task] | {"n_timesteps": None} == ENTRIES["default"] | {"n_timesteps": None}
+
+
+@pytest.mark.filterwarnings("ignore:.*out of date")
+@pytest.mark.parametrize("env_id", sorted(set(ENTRIES) - {"default"}))
+def test_every_entry_builds_a_model(env_id, tmp_path):
+    if env_id == "Pusher-v4":
+        pytest.skip("needs mujoco<3")
+    zoo.register()
+    model, saved = manager(tmp_path, env_id=env_id, hyperparams={"buffer_size": 100}).setup_experiment()
+    assert isinstance(model, CGP)
+    assert model.gamma == ENTRIES[env_id]["gamma"]
+    assert model.policy.net_arch == eval(ENTRIES[env_id]["policy_kwargs"])["net_arch"]
+    assert (model.action_noise is not None) == ("noise_type" in saved)
+
+
+@pytest.mark.parametrize("n_actions", [1, 6])
+def test_converter_rebuilds_what_the_sampler_returned(n_actions):
+    rl_zoo3_manager = SimpleNamespace(n_actions=n_actions)
+    env = SimpleNamespace(action_space=spaces.Box(-1, 1, (n_actions,)))
+    seen = set()
+    for parameters in random_parameters(200):
+        sampled = zoo.sample_cgp_params(FixedTrial(parameters), n_actions, 1, NO_HER)
+        # As `--trial-id` does; rl_zoo3 makes the noise from its type and standard deviation.
+        converted = zoo.convert_cgp_params(parameters)
+        seen.add((parameters["noise_type"], converted["policy_loss"], converted["policy_training"], converted["cem_result"]))
+        converted = ExperimentManager._preprocess_action_noise(rl_zoo3_manager, converted, {}, env)
+
+        noise, rebuilt_noise = sampled.pop("action_noise"), converted.pop("action_noise")
+        assert repr(noise) == repr(rebuilt_noise)
+        assert noise().shape == (n_actions,)
+        assert sampled == converted
+    # Every noise, variant and result of CEM was among them.
+    assert len(seen) == 3 * 5 * 2
+
+
+def test_no_noise_takes_back_the_noise_of_a_yaml_entry(tmp_path):
+    zoo.register()
+    parameters = random_parameters(1)[0] | {"noise_type": "none", "noise_std": 0.3}
+    sampled = zoo.sample_cgp_params(FixedTrial(parameters), 1, 1, NO_HER)
+    hyperparams = zoo.convert_cgp_params(parameters) | TINY
+    model, _ = manager(tmp_path, env_id="MountainCarContinuous-v0", hyperparams=hyperparams).setup_experiment()
+    assert np.all(model.action_noise() == 0)
+    assert np.all(sampled["action_noise"]() == 0)
+
+
+def test_with_her_the_goals_are_sampled_and_the_rest_is_kept():
+    additional_args = {"using_her_replay_buffer": True, "her_kwargs": {"copy_info_dict": True, "n_sampled_goal": 99}}
+    (parameters,) = random_parameters(1, additional_args)
+    sampled = zoo.sample_cgp_params(FixedTrial(parameters), 1, 1, additional_args)
+    converted = zoo.convert_cgp_params(parameters)
+    goals = {name: parameters[name] for name in ("n_sampled_goal", "goal_selection_strategy")}
+    assert converted["replay_buffer_kwargs"] == goals
+    assert sampled["replay_buffer_kwargs"] == goals | {"copy_info_dict": True}
+    env = BitFlippingEnv(n_bits=3, continuous=True)
+    model = CGP("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, **sampled | TINY)
+    assert model.replay_buffer.n_sampled_goal == parameters["n_sampled_goal"]
+
+
+def corners() -> list[dict]:
+    """The parameters of a trial at the lowest and at the highest of every range, once for each variant."""
+    trial = optuna.create_study().ask()
+    zoo.sample_cgp_params(trial, 1, 1, NO_HER)
+    ranges = {name: d for name, d in trial.distributions.items() if not isinstance(d, CategoricalDistribution)}
+    ends = [{name: getattr(distribution, end) for name, distribution in ranges.items()} for end in ("low", "high")]
+    return [trial.params | end | {"variant": variant} for end in ends for variant in zoo.VARIANTS]
+
+
+@pytest.mark.parametrize("parameters", corners() + random_parameters(50))
+def test_every_sample_constructs(parameters):
+    trial = FixedTrial(parameters)
+    hyperparams = zoo.sample_cgp_params(trial, 1, 1, NO_HER)
+    # An entry's way to infer must not outlive its actor.
+    model = CGP("MlpPolicy", "Pendulum-v1", **{"inference": "averaged_actor"} | hyperparams | TINY)
+    assert model.inference == ("cem" if model.policy_loss is None else "averaged_actor")
+    assert (model.cem_samples, model.cem_elites) == (trial.user_attrs["cem_samples"], trial.user_attrs["cem_elites"])
