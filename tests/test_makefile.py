@@ -1,0 +1,170 @@
+"""The Makefile's set-up, with a stand-in for Python that installs nothing and notes what it was asked."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+REQUIREMENTS = ("setup.cfg", "pyproject.toml", "constraints.txt", "_build_backend.py", "sb3_cgp/version.txt")
+
+pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+
+# Notes each call, with <> around an argument that has spaces; `-m venv` puts a copy of the stand-in where the
+# environment's interpreter would be; $FAIL names what fails.
+STAND_IN = """#!/bin/sh
+for argument; do
+  case "$argument" in *" "*) printf "<%s> " "$argument" ;; *) printf "%s " "$argument" ;; esac
+done >> "$CALLS"
+echo >> "$CALLS"
+case "$*" in
+  --version) echo "Python 3.9.1" ;;
+  "-c import sys"*) [ -z "$OLD" ] ;;
+  "-m venv"*) mkdir -p .venv/bin && cp "$0" .venv/bin/python && chmod +x .venv/bin/python ;;
+  "-m benchmark.plan"*) echo "250 4" ;;
+  *"$FAIL"*) [ -z "$FAIL" ] ;;
+esac
+"""
+
+
+class Clone:
+    """A fresh clone in a folder whose name has spaces."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / "a fresh clone"
+        for name in ("Makefile", *REQUIREMENTS):
+            (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, self.folder / name)
+        self.python = folder / "python"
+        self.python.write_text(STAND_IN)
+        self.python.chmod(0o755)
+        self.calls_file = folder / "calls"
+
+    def make(self, *arguments: str, **environment: str) -> tuple[list[str], "subprocess.CompletedProcess[str]"]:
+        """Run make; return what the stand-in was asked, and how make ended."""
+        self.calls_file.write_text("")
+        # Under `make test` our own make's flags and variables would reach the one that is tested
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))}
+        ended = subprocess.run(
+            ["make", f"PYTHON={self.python}", *arguments],
+            cwd=self.folder,
+            env={**inherited, "CALLS": str(self.calls_file), "FAIL": "", "OLD": "", **environment},
+            capture_output=True,
+            text=True,
+        )
+        return [line.rstrip() for line in self.calls_file.read_text().splitlines()], ended
+
+    def touch(self, name: str) -> None:
+        """Make a file newer than every other."""
+        newest = max(path.stat().st_mtime_ns for path in self.folder.rglob("*"))
+        os.utime(self.folder / name, ns=(newest + 10**9, newest + 10**9))
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Clone:
+    return Clone(tmp_path)
+
+
+def starting(calls: list[str], prefix: str) -> list[str]:
+    return [call for call in calls if call.startswith(prefix)]
+
+
+def test_train_from_a_fresh_clone(clone: Clone) -> None:
+    calls, ended = clone.make("train")
+    assert ended.returncode == 0, ended.stderr
+    assert calls[1:] == [
+        "-m venv --clear .venv",
+        "-m pip install -c constraints.txt -e .",
+        "-m benchmark.plan --algo cgp --env Pendulum-v1 --folder logs",
+        "-m rl_zoo3.train --algo cgp --env Pendulum-v1 --seed 0 --num-threads 1 --eval-freq 250 --eval-episodes 10 "
+        "--log-folder logs --progress",
+        "-m benchmark.report --algo cgp --env Pendulum-v1 --folder logs --exp-id 4",
+    ]
+
+
+def test_train_takes_the_settings_of_a_run(clone: Clone) -> None:
+    calls, _ = clone.make(
+        "train", "ALGO=td3", "ENV=Ant-v5", "STEPS=60000", "SEED=2", "EVAL_FREQ=500", "LOGS=my logs",
+        "PARAMS=batch_size:128 policy_loss:\"'qgp'\"", "ARGS=--save-freq 100", "THREADS=4",
+    )  # fmt: skip
+    assert starting(calls, "-m benchmark.plan") == [
+        "-m benchmark.plan --algo td3 --env Ant-v5 --folder <my logs> --steps 60000"
+    ]
+    assert starting(calls, "-m rl_zoo3.train") == [
+        "-m rl_zoo3.train --algo td3 --env Ant-v5 --seed 2 --num-threads 4 --n-timesteps 60000 --eval-freq 500 "
+        "--eval-episodes 10 --log-folder <my logs> --progress -params batch_size:128 policy_loss:'qgp' --save-freq 100"
+    ]
+
+
+def test_settings_are_not_taken_from_the_environment(clone: Clone) -> None:
+    calls, _ = clone.make("train", ENV="/home/someone/.shrc", SEED="salt")
+    assert "--env Pendulum-v1 --seed 0" in starting(calls, "-m rl_zoo3.train")[0]
+
+
+def test_failed_training_is_not_reported(clone: Clone) -> None:
+    calls, ended = clone.make("train", FAIL="rl_zoo3.train")
+    assert ended.returncode != 0
+    assert not starting(calls, "-m benchmark.report")
+
+
+@pytest.mark.parametrize("goal", ["train", "test"])
+def test_nothing_is_installed_twice(clone: Clone, goal: str) -> None:
+    clone.make(goal)
+    calls, ended = clone.make(goal)
+    assert ended.returncode == 0, ended.stderr
+    assert not starting(calls, "-m pip")
+    assert not starting(calls, "-m venv")
+
+
+@pytest.mark.parametrize("name", REQUIREMENTS)
+def test_changed_requirements_are_installed_over_the_environment(clone: Clone, name: str) -> None:
+    clone.make("lint")
+    clone.touch(name)
+    calls, _ = clone.make("lint")
+    assert starting(calls, "-m pip") == [
+        "-m pip install -c constraints.txt -e .",
+        "-m pip install -c constraints.txt -e .[tests]",
+    ]
+    assert not starting(calls, "-m venv")
+
+
+@pytest.mark.parametrize("failing", ["-e .", "-e .[tests]"])
+def test_half_made_environment_is_made_afresh(clone: Clone, failing: str) -> None:
+    _, ended = clone.make("lint", FAIL=f"pip install -c constraints.txt {failing}")
+    assert ended.returncode != 0
+    calls, ended = clone.make("lint")
+    assert ended.returncode == 0, ended.stderr
+    assert starting(calls, "-m venv") == ["-m venv --clear .venv"]
+
+
+def test_interrupted_change_of_requirements_is_made_afresh(clone: Clone) -> None:
+    clone.make("train")
+    clone.touch("setup.cfg")
+    _, ended = clone.make("train", FAIL="pip install")
+    assert ended.returncode != 0
+    calls, _ = clone.make("train")
+    assert starting(calls, "-m venv") == ["-m venv --clear .venv"]
+
+
+def test_old_python_is_refused_by_name(clone: Clone) -> None:
+    calls, ended = clone.make("train", OLD="yes")
+    assert ended.returncode != 0
+    assert f"needs Python 3.10 or newer, but {clone.python} is: Python 3.9.1" in ended.stderr
+    assert not starting(calls, "-m venv")
+
+
+def test_help_is_the_default_and_lists_every_goal(clone: Clone) -> None:
+    calls, ended = clone.make()
+    assert not calls
+    for goal in ("train", "test", "test-slow", "lint", "format", "clean"):
+        assert f"make {goal} " in ended.stdout
+
+
+def test_clean_leaves_the_trained_models(clone: Clone) -> None:
+    clone.make("train")
+    (clone.folder / "logs").mkdir()
+    clone.make("clean")
+    assert (clone.folder / "logs").is_dir()
+    assert not (clone.folder / ".venv").exists()
