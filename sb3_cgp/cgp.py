@@ -318,7 +318,7 @@ class CGP(DeferredBufferAlgorithm):
                 self._update_average(self.actor, self.actor_target)
 
             if self._n_updates % DIAGNOSTICS_INTERVAL == 0:
-                self._log_diagnostics(batch.observations)
+                self._log_diagnostics(batch.observations, has_actor=self._trains_policy_online)
 
         self._log_training(gradient_steps, critic_losses, actor_losses, q_values)
 
@@ -384,9 +384,9 @@ class CGP(DeferredBufferAlgorithm):
         if len(actor_losses) > 0:
             self.logger.record("train/actor_loss", np.mean(actor_losses))
 
-    def _log_diagnostics(self, observations: th.Tensor) -> None:
+    def _log_diagnostics(self, observations: th.Tensor, has_actor: bool) -> None:
         self.policy.set_training_mode(False)
-        for key, value in policy_diagnostics(self.policy, observations, has_actor=self.policy_loss is not None).items():
+        for key, value in policy_diagnostics(self.policy, observations, has_actor).items():
             self.logger.record_mean(key, value)
         self.policy.set_training_mode(True)
 
@@ -436,9 +436,8 @@ class CGP(DeferredBufferAlgorithm):
         Train the policy to convergence on the critics and the replay buffer as they are (the paper's offline training).
 
         It has converged when the loss, averaged over rounds of 1,000 gradient steps, has not fallen below its lowest
-        value by more than 1 % for 5 rounds in a row. ``learn`` calls it in offline training; call it
-        yourself on a loaded model with a loaded replay buffer (and, if the model was trained with ``VecNormalize``,
-        with its environment set).
+        value by more than 1 % for 5 rounds in a row. ``learn`` calls it in offline training; call it yourself on a
+        loaded model with a loaded replay buffer (and, if it was trained with ``VecNormalize``, its environment set).
 
         Callbacks see each gradient step as a step in which no environment moved: ``num_timesteps`` stands still, no
         episode ends, rewards are 0. Logged values lie at ``num_timesteps`` plus the gradient steps.
@@ -472,7 +471,7 @@ class CGP(DeferredBufferAlgorithm):
 
         def after_round(n_steps: int, loss: float) -> None:
             self.logger.record("train/actor_loss", loss)
-            self._log_diagnostics(sample().observations)
+            self._log_diagnostics(sample().observations, has_actor=True)
             self.logger.dump(self.num_timesteps + n_steps)
 
         # Evaluations within the training score the actor that is being trained
