@@ -33,6 +33,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from benchmark.provenance import machine, package_versions
 
+# Far from the seeds that people train with: rl_zoo3 gives the training's environments the run's own
+EVALUATION_SEED = 10_000
 # A curve drawn from training episodes joins them into at most so many points
 TRAINING_POINTS = 50
 
@@ -374,7 +376,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--folder", default="logs", help="rl_zoo3's log folder (default: %(default)s)")
     parser.add_argument("--exp-id", default=0, type=int, help="number of the run (default: 0, the latest)")
     parser.add_argument("--episodes", default=20, type=int, help="episodes of the final evaluation (default: %(default)s)")
-    parser.add_argument("--seed", default=0, type=int, help="seed of the final evaluation (default: %(default)s)")
+    parser.add_argument(
+        "--seed", default=EVALUATION_SEED, type=int, help="seed of the final evaluation (default: %(default)s)"
+    )
     args = parser.parse_args(argv)
     try:
         run = find_run(args.folder, args.algo, args.env, args.exp_id)

@@ -9,8 +9,8 @@ from sb3_cgp import CGP
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-# Past the examples' warm-up of 1,000 steps
-LONGEST = 1_010
+# Past the warm-up of 10,000 random steps
+LONGEST = 10_010
 
 
 def test_there_are_examples():
