@@ -436,7 +436,7 @@ class CGP(DeferredBufferAlgorithm):
         Train the policy to convergence on the critics and the replay buffer as they are (the paper's offline training).
 
         It has converged when the loss, averaged over rounds of 1,000 gradient steps, has not fallen below its lowest
-        value by more than 1 % for 5 rounds in a row. ``learn`` calls it in offline training; call it yourself on a
+        value by more than 5 % for 5 rounds in a row. ``learn`` calls it in offline training; call it yourself on a
         loaded model with a loaded replay buffer (and, if it was trained with ``VecNormalize``, its environment set).
 
         Callbacks see each gradient step as a step in which no environment moved: ``num_timesteps`` stands still, no

@@ -25,7 +25,7 @@ class Plateau:
     :raises ValueError: if an argument is out of its range
     """
 
-    def __init__(self, patience: int = 5, tolerance: float = 0.01):
+    def __init__(self, patience: int = 5, tolerance: float = 0.05):
         require_count("patience", patience)
         require_number("tolerance", tolerance)
         self.patience = patience

@@ -45,7 +45,7 @@ def test_every_variant_swings_up_the_pendulum(variant, tmp_path):
     assert mean_return("Pendulum-v1", tmp_path, **VARIANTS[variant]) >= -200
 
 
-def test_cgp_balances_the_inverted_pendulum(tmp_path):
-    # The paper's configuration with smaller networks, as long as two cores allow. Random actions earn about 6 of 1000
-    hyperparams = dict(n_timesteps=15_000, policy_kwargs=dict(net_arch=[64, 64]))
-    assert mean_return("InvertedPendulum-v5", tmp_path, **hyperparams) >= 900
+def test_cgp_reaches_on_mujoco(tmp_path):
+    # The paper's configuration, made smaller for speed. Random torques earn about -43, none at all -12
+    hyperparams = dict(n_timesteps=15_000, batch_size=64, policy_kwargs=dict(net_arch=[64, 64]))
+    assert mean_return("Reacher-v5", tmp_path, **hyperparams) >= -10
