@@ -41,6 +41,13 @@ SelfCGP = TypeVar("SelfCGP", bound="CGP")
 DIAGNOSTICS_INTERVAL = 100
 
 
+def _as_schedule(rate: float | Schedule | str) -> Schedule:
+    """Make a schedule of a learning rate in any of the forms that are allowed."""
+    if isinstance(rate, str):
+        return LinearSchedule(float(rate.removeprefix(LINEAR_SCHEDULE_PREFIX)), 0.0, 1.0)
+    return FloatSchedule(rate)
+
+
 class CGP(DeferredBufferAlgorithm):
     """
     Cross-Entropy Guided Policies (CGP).
@@ -53,7 +60,8 @@ class CGP(DeferredBufferAlgorithm):
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param learning_rate: learning rate of the critics, and of the actor unless ``actor_learning_rate`` is given;
-        it can be a function of the current progress remaining (from 1 to 0)
+        it can be a function of the current progress remaining (from 1 to 0), or a string such as ``"lin_1e-3"`` that
+        falls linearly to 0
     :param buffer_size: size of the replay buffer
     :param learning_starts: how many random steps to take before learning starts; with few, CGP often fails
         (the paper's Appendix A)
@@ -81,8 +89,7 @@ class CGP(DeferredBufferAlgorithm):
     :param inference: what ``predict`` asks: the "actor", the "averaged_actor" (φ' of Algorithm 2) or "cem".
         None stands for the actor, or for CEM where there is no ``policy_loss``. In any case, CEM acts while training,
         and offline until the policy is trained.
-    :param actor_learning_rate: learning rate of the actor: a number, a function of the current progress remaining,
-        or a string such as ``"lin_1e-3"`` that falls linearly to 0. None stands for ``learning_rate``.
+    :param actor_learning_rate: learning rate of the actor, in the same forms. None stands for ``learning_rate``.
     :param policy_delay: The actor is updated once every ``policy_delay`` gradient steps
     :param target_update_interval: The target critics and the averaged actor are updated once every
         ``target_update_interval`` gradient steps
@@ -117,7 +124,7 @@ class CGP(DeferredBufferAlgorithm):
         self,
         policy: str | type[CGPPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
+        learning_rate: float | Schedule | str = 1e-3,
         buffer_size: int = 1_000_000,  # 1e6
         learning_starts: int = 10_000,
         batch_size: int = 128,
@@ -153,7 +160,7 @@ class CGP(DeferredBufferAlgorithm):
         super().__init__(
             policy,
             env,
-            learning_rate,
+            learning_rate,  # type: ignore[arg-type]  # a string is made a schedule in `_setup_lr_schedule`
             buffer_size,
             learning_starts,
             batch_size,
@@ -182,7 +189,7 @@ class CGP(DeferredBufferAlgorithm):
         self.cem_result = cem_result
         self.policy_loss = policy_loss
         self.policy_training = policy_training
-        self.inference = inference if inference is not None else ("cem" if policy_loss is None else "actor")
+        self.inference: str | None = inference
         self.actor_learning_rate = actor_learning_rate
         self.policy_delay = policy_delay
         self.target_update_interval = target_update_interval
@@ -204,13 +211,8 @@ class CGP(DeferredBufferAlgorithm):
         return env
 
     def _setup_lr_schedule(self) -> None:
-        super()._setup_lr_schedule()
-        rate = self.actor_learning_rate
-        self._actor_lr_schedule: Schedule | None = None
-        if isinstance(rate, str):
-            self._actor_lr_schedule = LinearSchedule(float(rate.removeprefix(LINEAR_SCHEDULE_PREFIX)), 0.0, 1.0)
-        elif rate is not None:
-            self._actor_lr_schedule = FloatSchedule(rate)
+        self.lr_schedule = _as_schedule(self.learning_rate)
+        self._actor_lr_schedule = None if self.actor_learning_rate is None else _as_schedule(self.actor_learning_rate)
 
     @property
     def actor_lr_schedule(self) -> Schedule:
@@ -219,11 +221,13 @@ class CGP(DeferredBufferAlgorithm):
 
     def _setup_model(self) -> None:
         # Here, as `load` bypasses the constructor
+        if self.inference is None:
+            self.inference = "cem" if self.policy_loss is None else "actor"
         check_cgp(self)
         require(issubclass(self.policy_class, CGPPolicy), "policy", self.policy_class, "a subclass of sb3_cgp.CGPPolicy")
         super()._setup_model()
         self._create_aliases()
-        if "selector" not in self.policy_kwargs:
+        if self.policy_kwargs.get("selector") is None:
             self.policy.selector = CEM(self.cem_iterations, self.cem_samples, self.cem_elites, self.cem_result)
         self._choose_inference()
 
@@ -235,6 +239,7 @@ class CGP(DeferredBufferAlgorithm):
 
     def _choose_inference(self) -> None:
         """Let ``predict`` ask what the user chose, or CEM while there is no trained actor."""
+        assert self.inference is not None  # settled in `_setup_model`
         actor_is_trained = self.policy_training == "online" or self._policy_is_trained
         self.policy.inference = self.inference if actor_is_trained else "cem"
 
@@ -412,6 +417,7 @@ class CGP(DeferredBufferAlgorithm):
         :return: the trained model
         :raises ValueError: if a reward, an observation or a loss is NaN or infinite
         """
+        n_updates = self._n_updates
         super().learn(
             total_timesteps=total_timesteps,
             callback=callback,
@@ -420,8 +426,8 @@ class CGP(DeferredBufferAlgorithm):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
-        # A policy of critics that never learnt would be worth less than CEM on them
-        if self.policy_training == "offline" and self._n_updates > 0:
+        # Without a gradient step of the critics, there is nothing new for the policy to learn
+        if self.policy_training == "offline" and self._n_updates > n_updates:
             self.train_policy(callback=callback, progress_bar=progress_bar)
         return self
 
@@ -439,6 +445,7 @@ class CGP(DeferredBufferAlgorithm):
         value by more than 5 % for 5 rounds in a row. ``learn`` calls it in offline training; call it yourself on a
         loaded model with a loaded replay buffer (and, if it was trained with ``VecNormalize``, its environment set).
 
+        A callback that stops it within its first round leaves CEM to act: so does one that has stopped ``learn`` before.
         Callbacks see each gradient step as a step in which no environment moved: ``num_timesteps`` stands still, no
         episode ends, rewards are 0. Logged values lie at ``num_timesteps`` plus the gradient steps.
 
@@ -446,7 +453,7 @@ class CGP(DeferredBufferAlgorithm):
         :param batch_size: observations per gradient step, by default the model's
         :param callback: callback(s) called at every gradient step; it stops when one returns False
         :param progress_bar: Display a progress bar using tqdm and rich.
-        :return: the model, whose ``predict`` asks the actor from now on, if ``inference`` says so
+        :return: the model, whose ``predict`` asks from now on what ``inference`` says
         :raises ValueError: if there is no policy loss or no data, or if a loss is NaN or infinite
         """
         require_count("max_steps", max_steps)
@@ -474,13 +481,15 @@ class CGP(DeferredBufferAlgorithm):
             self._log_diagnostics(sample().observations, has_actor=True)
             self.logger.dump(self.num_timesteps + n_steps)
 
-        # Evaluations within the training score the actor that is being trained
-        self.policy.inference = self.inference
+        # Callbacks score and save the actor that is being trained
+        is_trained, self._policy_is_trained = self._policy_is_trained, True
+        self._choose_inference()
         try:
             callback = self._init_callback(callback)
-            n_steps = descend_to_plateau(step, after_round, callback, max_steps, self.n_envs, progress_bar)
-            self._policy_is_trained = True
+            n_steps, is_enough = descend_to_plateau(step, after_round, callback, max_steps, self.n_envs, progress_bar)
+            is_trained = is_trained or is_enough
         finally:
+            self._policy_is_trained = is_trained
             self._choose_inference()
         if self.verbose >= 1:
             print(f"The policy was trained for {n_steps} gradient steps")

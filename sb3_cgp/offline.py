@@ -55,7 +55,7 @@ def descend_to_plateau(
     max_steps: int,
     n_envs: int,
     progress_bar: bool = False,
-) -> int:
+) -> tuple[int, bool]:
     """
     Repeat a gradient step until its loss, averaged over rounds of 1,000 steps, reaches a plateau.
 
@@ -67,7 +67,7 @@ def descend_to_plateau(
     :param max_steps: largest number of steps; a warning says if they did not suffice
     :param n_envs: number of environments, for the callbacks
     :param progress_bar: whether to display a progress bar
-    :return: the number of steps
+    :return: the number of steps, and whether they were enough for a policy: a round, or all that were asked for
     """
     standstill = dict(rewards=np.zeros(n_envs), dones=np.zeros(n_envs, dtype=bool), infos=[{} for _ in range(n_envs)])
     total_timesteps = callback.model.num_timesteps + max_steps * n_envs
@@ -87,4 +87,4 @@ def descend_to_plateau(
         # Told to whoever called `train_policy` or `learn`
         warnings.warn(f"The policy's loss had not reached a plateau after max_steps={max_steps} gradient steps.", stacklevel=3)
     callback.on_training_end()
-    return n_steps
+    return n_steps, n_steps >= min(ROUND, max_steps)

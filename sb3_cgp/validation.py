@@ -98,8 +98,8 @@ def check_action_space(action_space: spaces.Space) -> None:
     """
     require(isinstance(action_space, spaces.Box), "action_space", action_space, "a gymnasium.spaces.Box")
     low, high = action_space.low, action_space.high  # type: ignore[attr-defined]
-    bounded = bool(np.all(np.isfinite(low)) and np.all(np.isfinite(high)) and np.all(low < high))
-    require(bounded, "action_space", action_space, "bounded: finite low < high in every dimension")
+    bounded = low.size > 0 and bool(np.all(np.isfinite(low)) and np.all(np.isfinite(high)) and np.all(low < high))
+    require(bounded, "action_space", action_space, "bounded: finite low < high in every dimension, and at least one")
 
 
 def check_learning_rate(name: str, value: Any) -> None:
@@ -132,8 +132,10 @@ def check_train_freq(value: Any) -> None:
     :param value: the argument's value
     :raises ValueError: if the count is not an integer >= 1 or the unit is unknown
     """
-    is_pair = isinstance(value, (tuple, list)) and len(value) == 2
+    is_pair = isinstance(value, tuple) and len(value) == 2
     frequency, unit = value if is_pair else (value, "step")
+    # SB3 takes no NumPy integer here
+    require(isinstance(frequency, int), "train_freq", value, "an int, or a tuple of an int and a unit")
     require_count("train_freq", frequency)
     require(getattr(unit, "value", unit) in ("step", "episode"), "train_freq", value, "in unit 'step' or 'episode'")
 
@@ -202,6 +204,8 @@ def _check_variant(model: Any) -> None:
     require_choice("policy_loss", model.policy_loss, POLICY_LOSSES)
     require_choice("policy_training", model.policy_training, POLICY_TRAININGS)
     require_choice("inference", model.inference, INFERENCES)
+    policy_inference = model.policy_kwargs.get("inference")
+    require(policy_inference is None, "policy_kwargs['inference']", policy_inference, "given as `inference`, outside them")
     if model.policy_loss is None:
         require(
             model.policy_training == "online", "policy_training", model.policy_training, "'online' without a `policy_loss`"

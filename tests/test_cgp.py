@@ -205,13 +205,34 @@ class TestOffline:
         model = make_model(policy_training="offline").learn(600, callback=callback)
         assert model.num_timesteps == 400
         assert callback.n_episodes == 2
+        # It stopped the policy's training too, at once
+        assert model.policy.inference == "cem"
 
     def test_a_callback_can_stop_it(self):
-        watcher = self.Watcher(stop_after=107)
-        model = make_model(policy_training="offline").learn(100, callback=watcher)
-        assert watcher.n_calls == 107
-        assert watcher.ends == 2
-        assert model.policy.inference == "actor"
+        for stop_after, inference in ((107, "cem"), (117, "actor")):
+            watcher = self.Watcher(stop_after)
+            model = make_model(policy_training="offline").learn(100, callback=watcher)
+            assert watcher.n_calls == stop_after
+            assert watcher.ends == 2
+            # Less than a round makes no policy
+            assert model.policy.inference == inference
+
+    def test_a_model_that_a_callback_saves_acts_as_it_was_scored(self, tmp_path):
+        class Saver(self.Watcher):
+            def _on_step(self):
+                self.model.save(tmp_path / str(self.n_calls))
+                return super()._on_step()
+
+        make_model(policy_training="offline").learn(100, callback=Saver(stop_after=115))
+        assert CGP.load(tmp_path / "100").policy.inference == "cem"
+        assert CGP.load(tmp_path / "105").policy.inference == "actor"
+
+    def test_without_a_step_of_the_critics_the_policy_rests(self, tmp_path):
+        make_model(policy_training="offline").learn(100).save(tmp_path / "model")
+        model = CGP.load(tmp_path / "model", env=gym.make("Pendulum-v1"))
+        before = next(model.actor.parameters()).clone()
+        model.learn(10)
+        assert th.equal(before, next(model.actor.parameters()))
 
     def test_an_error_in_it_leaves_cem_to_act(self):
         class Broken(self.Watcher):
@@ -277,6 +298,7 @@ def test_loading_changes_arguments_and_checks_them(tmp_path):
     with pytest.raises(ValueError, match="`policy_delay` is 'banana', but must be an integer >= 1"):
         CGP.load(tmp_path / "model", policy_delay="banana")
     # As rl_zoo3's enjoy does
+    assert CGP.load(tmp_path / "model", inference=None).inference == "actor"
     assert CGP.load(tmp_path / "model", custom_objects=dict(learning_rate=0.0, lr_schedule=lambda _: 0.0))
 
 
@@ -354,6 +376,7 @@ def test_learning_rates_are_separate_and_follow_their_schedules():
     assert rates[-1] == pytest.approx((1e-2 * 0.01, 4e-3 * 0.01))
     # `train` set these at step 76, when 24 of 100 steps remained
     assert rates[76] == pytest.approx((1e-2 * 0.24, 4e-3 * 0.24))
+    assert make_model(learning_rate="lin_1e-2").actor_lr_schedule(0.25) == pytest.approx(2.5e-3)
     for actor_learning_rate in (None, 1e-3, lambda progress: 1e-3):
         model = make_model(learning_rate=1e-3, actor_learning_rate=actor_learning_rate)
         assert model.actor_lr_schedule(0.5) == 1e-3
@@ -377,6 +400,8 @@ EMPTY = spaces.Box(np.ones(1, np.float32), np.ones(1, np.float32))
         (dict(n_steps=0), "`n_steps` is 0, but must be an integer >= 1"),
         (dict(learning_starts=-1), "`learning_starts` is -1, but must be an integer >= 0"),
         (dict(gradient_steps=-2), "`gradient_steps` is -2, but must be an integer >= -1"),
+        (dict(train_freq=[1, "step"]), "`train_freq` is .*, but must be an int, or a tuple of an int and a unit"),
+        (dict(policy_kwargs=dict(inference="cem")), "'inference'.*outside them"),
         (dict(train_freq=0), "`train_freq` is 0, but must be an integer >= 1"),
         (dict(train_freq=(1, "day")), "`train_freq` is .*, but must be in unit 'step' or 'episode'"),
         (dict(policy_delay=0), "`policy_delay` is 0, but must be an integer >= 1"),
@@ -407,7 +432,9 @@ def test_bad_arguments_are_refused_at_construction_by_name_value_and_what_is_all
         make_model(**arguments)
 
 
-@pytest.mark.parametrize("action_space", [spaces.Discrete(3), spaces.MultiBinary(2), UNBOUNDED, EMPTY], ids=str)
+@pytest.mark.parametrize(
+    "action_space", [spaces.Discrete(3), spaces.MultiBinary(2), UNBOUNDED, EMPTY, spaces.Box(-1, 1, (0,))], ids=str
+)
 def test_action_spaces_that_cem_cannot_search_are_refused(action_space):
     class Unsearchable(gym.Env):
         observation_space = spaces.Box(-1, 1, (2,))
@@ -424,8 +451,13 @@ def test_noise_of_several_environments_is_checked_too():
 
 
 def test_a_policy_refuses_an_unknown_inference():
+    box = spaces.Box(-1, 1, (1,))
     with pytest.raises(ValueError, match="`inference` is 'dream'"):
-        make_model(policy_kwargs=dict(inference="dream"))
+        CGPPolicy(box, box, lambda _: 1e-3, inference="dream")
+
+
+def test_no_selector_is_cem_as_it_was_asked_for():
+    assert make_model(cem_iterations=4, policy_kwargs=dict(selector=None)).policy.selector.iterations == 4
 
 
 def test_refuses_a_policy_that_has_no_selector():
