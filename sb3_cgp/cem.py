@@ -88,6 +88,7 @@ class CEM:
             winners = values.topk(self.elites, dim=1).indices  # (B, K), best first
             elites = samples.gather(1, winners.unsqueeze(2).expand(-1, -1, action_dim))  # (B, K, A)
             mean = elites.mean(dim=1)
-            std = elites.std(dim=1, correction=0)
+            # Much faster here than `std`
+            std = (elites - mean.unsqueeze(1)).square().mean(dim=1).sqrt()
             best = elites[:, 0]
         return Selection(actions=th.tanh(best if self.result == "best" else mean), spread=std)

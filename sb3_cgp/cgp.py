@@ -82,6 +82,9 @@ class CGP(DeferredBufferAlgorithm):
     :param cem_samples: actions that CEM samples per state and iteration
     :param cem_elites: best samples that CEM's next iteration is fitted to, at most ``cem_samples``
     :param cem_result: "best" acts by the best sample of the last iteration (the paper), "mean" by the elites' mean
+    :param cem_dtype: what the critic's hidden layers compute in while CEM asks it: "float32", "bfloat16", or "auto", which
+        is bfloat16 on processors that multiply it natively. Values, actions and the critic's own training are
+        float32 in any case.
     :param policy_loss: what the actor learns from: "cgp" imitates CEM, "qgp" climbs the critic's gradient,
         None trains no actor, so that CEM acts at inference too
     :param policy_training: "online" trains the actor along with the critics, "offline" when ``learn`` has finished
@@ -141,6 +144,7 @@ class CGP(DeferredBufferAlgorithm):
         cem_samples: int = 64,
         cem_elites: int = 6,
         cem_result: str = "best",
+        cem_dtype: str = "auto",
         policy_loss: str | None = "cgp",
         policy_training: str = "online",
         inference: str | None = None,
@@ -187,6 +191,7 @@ class CGP(DeferredBufferAlgorithm):
         self.cem_samples = cem_samples
         self.cem_elites = cem_elites
         self.cem_result = cem_result
+        self.cem_dtype = cem_dtype
         self.policy_loss = policy_loss
         self.policy_training = policy_training
         self.inference: str | None = inference
@@ -229,6 +234,7 @@ class CGP(DeferredBufferAlgorithm):
         self._create_aliases()
         if self.policy_kwargs.get("selector") is None:
             self.policy.selector = CEM(self.cem_iterations, self.cem_samples, self.cem_elites, self.cem_result)
+        self.policy.cem_dtype = self.cem_dtype
         self._choose_inference()
 
     def _create_aliases(self) -> None:

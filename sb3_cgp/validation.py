@@ -13,6 +13,7 @@ CEM_RESULTS = ("best", "mean")
 POLICY_LOSSES = ("cgp", "qgp", None)
 POLICY_TRAININGS = ("online", "offline")
 INFERENCES = ("actor", "averaged_actor", "cem")
+SCORING_DTYPES = ("auto", "float32", "bfloat16")
 LINEAR_SCHEDULE_PREFIX = "lin_"
 
 
@@ -183,6 +184,7 @@ def check_cgp(model: Any) -> None:
     """
     check_action_space(model.action_space)
     check_cem(model.cem_iterations, model.cem_samples, model.cem_elites, model.cem_result, prefix="cem_")
+    require_choice("cem_dtype", model.cem_dtype, SCORING_DTYPES)
     for name in ("batch_size", "buffer_size", "n_steps", "policy_delay", "target_update_interval"):
         require_count(name, getattr(model, name))
     require_count("learning_starts", model.learning_starts, minimum=0)
@@ -204,8 +206,9 @@ def _check_variant(model: Any) -> None:
     require_choice("policy_loss", model.policy_loss, POLICY_LOSSES)
     require_choice("policy_training", model.policy_training, POLICY_TRAININGS)
     require_choice("inference", model.inference, INFERENCES)
-    policy_inference = model.policy_kwargs.get("inference")
-    require(policy_inference is None, "policy_kwargs['inference']", policy_inference, "given as `inference`, outside them")
+    for name in ("inference", "cem_dtype"):
+        value = model.policy_kwargs.get(name)
+        require(value is None, f"policy_kwargs['{name}']", value, f"given as `{name}`, outside them")
     if model.policy_loss is None:
         require(
             model.policy_training == "online", "policy_training", model.policy_training, "'online' without a `policy_loss`"

@@ -348,13 +348,15 @@ def test_a_policy_saved_alone_keeps_every_argument(policy_class, tmp_path):
     box = spaces.Box(0, 255, (3, 36, 36), np.uint8)
     space = {CGPPolicy: spaces.Box(-1, 1, (3,)), CnnPolicy: box, MultiInputPolicy: spaces.Dict(image=box)}[policy_class]
     policy = policy_class(space, spaces.Box(-2, 2, (2,)), lambda _: 1e-3, net_arch=[8], activation_fn=th.nn.Tanh, n_critics=3,
-                          selector=CEM(3, 10, 2), inference="cem", optimizer_kwargs=dict(weight_decay=0.1))  # fmt: skip
+                          selector=CEM(3, 10, 2), inference="cem", cem_dtype="float32",
+                          optimizer_kwargs=dict(weight_decay=0.1))  # fmt: skip
     named = set(inspect.signature(CGPPolicy.__init__).parameters) - {"self"}
     assert named <= set(policy._get_constructor_parameters())
     policy.save(tmp_path / "policy")
     loaded = policy_class.load(tmp_path / "policy")
     assert repr(loaded.selector) == "CEM(iterations=3, samples=10, elites=2, result='best')"
     assert loaded.inference == "cem"
+    assert loaded.cem_dtype == "float32"
     observation = space.sample()
     th.manual_seed(0)
     action = policy.predict(observation)[0]
@@ -395,6 +397,8 @@ EMPTY = spaces.Box(np.ones(1, np.float32), np.ones(1, np.float32))
         (dict(cem_samples=8.0), "`cem_samples` is 8.0, but must be an integer >= 1"),
         (dict(cem_elites=True), "`cem_elites` is True, but must be an integer >= 1"),
         (dict(cem_result="median"), "`cem_result` is 'median', but must be one of 'best', 'mean'"),
+        (dict(cem_dtype="float16"), "`cem_dtype` is 'float16', but must be one of 'auto', 'float32', 'bfloat16'"),
+        (dict(policy_kwargs=dict(cem_dtype="float32")), "'cem_dtype'.*outside them"),
         (dict(batch_size=0), "`batch_size` is 0, but must be an integer >= 1"),
         (dict(buffer_size=0), "`buffer_size` is 0, but must be an integer >= 1"),
         (dict(n_steps=0), "`n_steps` is 0, but must be an integer >= 1"),
@@ -450,10 +454,35 @@ def test_noise_of_several_environments_is_checked_too():
         make_model(action_noise=noise)
 
 
-def test_a_policy_refuses_an_unknown_inference():
+@pytest.mark.parametrize("argument", ["inference", "cem_dtype"])
+def test_a_policy_refuses_an_unknown_choice(argument):
     box = spaces.Box(-1, 1, (1,))
-    with pytest.raises(ValueError, match="`inference` is 'dream'"):
-        CGPPolicy(box, box, lambda _: 1e-3, inference="dream")
+    with pytest.raises(ValueError, match=f"`{argument}` is 'dream'"):
+        CGPPolicy(box, box, lambda _: 1e-3, **{argument: "dream"})
+
+
+def test_the_data_type_of_cem_reaches_the_scores_and_can_be_changed_when_loading(tmp_path):
+    model = make_model(cem_dtype="bfloat16", policy_kwargs=dict(net_arch=[32, 32]))
+    model.save(tmp_path / "model")
+    observations = th.randn(64, *model.observation_space.shape)
+
+    def selected(model):
+        th.manual_seed(0)
+        return model.policy.select_actions(observations, model.critic).actions
+
+    exact = CGP.load(tmp_path / "model", cem_dtype="float32")
+    assert (CGP.load(tmp_path / "model").cem_dtype, exact.cem_dtype) == ("bfloat16", "float32")
+    assert th.equal(selected(CGP.load(tmp_path / "model")), selected(model))
+    assert not th.equal(selected(exact), selected(model))
+
+
+@pytest.mark.parametrize(("given", "fused"), [(None, True), (dict(weight_decay=0.1), True), (dict(fused=False), False)])
+def test_adam_is_fused_unless_the_user_says_otherwise(given, fused):
+    model = make_model(policy_kwargs=dict(net_arch=[8], optimizer_kwargs=given))
+    for network in (model.actor, model.critic):
+        assert network.optimizer.defaults["fused"] is fused
+    sgd = make_model(policy_kwargs=dict(net_arch=[8], optimizer_class=th.optim.SGD))
+    assert sgd.actor.optimizer.defaults.get("fused") is None
 
 
 def test_no_selector_is_cem_as_it_was_asked_for():

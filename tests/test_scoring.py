@@ -1,5 +1,6 @@
 """The fast way of scoring many actions against the plain one, and both against a matrix product at a time."""
 
+import numpy as np
 import oracles
 import pytest
 import torch as th
@@ -70,3 +71,79 @@ def test_scoring_changes_neither_its_inputs_nor_the_network():
     assert th.equal(score(actions), score(actions))
     for old, new in zip(before, (features, actions, *network.parameters()), strict=True):
         assert th.equal(old, new)
+
+
+def hidden_bfloat16(network, features, actions):
+    """The network row by row, what enters and what parameterises a hidden layer rounded to bfloat16."""
+    layers = [layer for layer in network if isinstance(layer, nn.Linear)]
+    scores = th.empty(actions.shape[:2])
+    for state, index in np.ndindex(*actions.shape[:2]):
+        hidden = oracles.perceptron([layers[0].weight], [layers[0].bias], th.cat([features[state], actions[state, index]]))
+        for layer in layers[1:-1]:
+            rounded = [tensor.bfloat16() for tensor in (layer.weight, layer.bias, hidden.clamp(min=0.0))]
+            hidden = oracles.perceptron(rounded[:1], rounded[1:2], rounded[2]).bfloat16().double()
+        hidden = oracles.perceptron([layers[-1].weight], [layers[-1].bias], hidden.clamp(min=0.0))
+        scores[state, index] = hidden.item()
+    return scores
+
+
+@pytest.mark.parametrize("with_onednn", [True, False])
+@th.no_grad()
+def test_bfloat16_rounds_the_hidden_layers_and_nothing_else(monkeypatch, with_onednn):
+    if not with_onednn:
+        monkeypatch.setattr(scoring, "_onednn_linear", None)
+    network = mlp([32, 64, 16])
+    features = th.randn(4, N_FEATURES)
+    actions = th.rand(4, 6, ACTION_DIM) * 2 - 1
+    # A value so large that bfloat16 could not tell the actions apart
+    network[-1].bias += 1_000.0
+    scores = q_score(network, features, th.bfloat16)(actions)
+    exact = repeated_q_score(network, features)(actions)
+    assert scores.dtype == th.float32
+    assert len(scores.unique()) == scores.numel()
+    th.testing.assert_close(scores, hidden_bfloat16(network, features, actions), rtol=0.0, atol=2e-3)
+    # It does round, by less than two bfloat16 numbers near 1000 lie apart
+    assert 0.0 < (scores - exact).abs().max() < 0.1
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@th.no_grad()
+def test_bfloat16_is_close_for_any_network_and_only_where_a_hidden_layer_gains(name):
+    network = NETWORKS[name]
+    features = th.randn(16, N_FEATURES)
+    actions = th.rand(16, 9, ACTION_DIM) * 2 - 1
+    scores = q_score(network, features, th.bfloat16)(actions)
+    exact = q_score(network, features)(actions)
+    th.testing.assert_close(scores, exact, rtol=0.05, atol=0.05)
+    has_rounded = not th.equal(scores, exact)
+    assert has_rounded == (name in ("two hidden layers", "three layers, tanh", "without bias"))
+
+
+@pytest.mark.parametrize(
+    ("setting", "capabilities", "dtype"),
+    [
+        ("auto", {"avx512_bf16": True}, th.bfloat16),
+        ("auto", {"avx512_bf16": False, "amx_bf16": True}, th.bfloat16),
+        ("auto", {"avx512_f": True}, th.float32),
+        ("auto", None, th.float32),
+        ("float32", {"avx512_bf16": True}, th.float32),
+        ("bfloat16", {}, th.bfloat16),
+    ],
+)
+def test_auto_is_bfloat16_where_the_processor_has_it(monkeypatch, setting, capabilities, dtype):
+    if capabilities is None:
+        # An older PyTorch
+        monkeypatch.delattr(th.cpu, "get_capabilities", raising=False)
+    else:
+        monkeypatch.setattr(th.cpu, "get_capabilities", lambda: capabilities, raising=False)
+    assert scoring.scoring_dtype(setting, th.device("cpu")) == dtype
+
+
+def test_auto_is_float32_on_a_gpu(monkeypatch):
+    monkeypatch.setattr(th.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
+    assert scoring.scoring_dtype("auto", th.device("cuda")) == th.float32
+
+
+def test_the_private_function_exists_in_the_tested_pytorch():
+    # Without it everything works, but no faster than MKL: the constraints' PyTorch should have it
+    assert scoring._onednn_linear is not None or not th.backends.mkldnn.is_available()
