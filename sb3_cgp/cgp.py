@@ -21,11 +21,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.td3.policies import Actor
 
 from sb3_cgp.cem import CEM
-from sb3_cgp.deferred import DeferredBufferAlgorithm
 from sb3_cgp.diagnostics import policy_diagnostics
 from sb3_cgp.losses import bootstrap_target, cgp_loss, critic_loss, qgp_loss, smooth_target_actions
 from sb3_cgp.offline import descend_to_plateau
 from sb3_cgp.policies import CGPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_cgp.replay import LeanReplayAlgorithm
 from sb3_cgp.validation import (
     LINEAR_SCHEDULE_PREFIX,
     check_action_space,
@@ -48,7 +48,7 @@ def _as_schedule(rate: float | Schedule | str) -> Schedule:
     return FloatSchedule(rate)
 
 
-class CGP(DeferredBufferAlgorithm):
+class CGP(LeanReplayAlgorithm):
     """
     Cross-Entropy Guided Policies (CGP).
 
@@ -211,7 +211,7 @@ class CGP(DeferredBufferAlgorithm):
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         # The first place that sees every environment's action space, before SB3's assertions, which name no value
-        env = DeferredBufferAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        env = LeanReplayAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         check_action_space(env.action_space)
         return env
 

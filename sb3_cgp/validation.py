@@ -15,6 +15,7 @@ POLICY_TRAININGS = ("online", "offline")
 INFERENCES = ("actor", "averaged_actor", "cem")
 SCORING_DTYPES = ("auto", "float32", "bfloat16")
 LINEAR_SCHEDULE_PREFIX = "lin_"
+LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 
 
 def require(condition: bool, name: str, value: Any, allowed: str) -> None:
@@ -157,7 +158,7 @@ def check_action_noise(action_noise: ActionNoise | None) -> None:
 
 def check_finite(name: str, values: Any, timestep: int) -> None:
     """
-    Stop the training at the first NaN or infinite value that the environment returns.
+    Stop the training at the first value that the environment returns and that is NaN or infinite, in float32.
 
     :param name: what the values are
     :param values: an array, or arrays by key
@@ -165,10 +166,11 @@ def check_finite(name: str, values: Any, timestep: int) -> None:
     :raises ValueError: if a value is NaN or infinite
     """
     for key, array in values.items() if isinstance(values, dict) else [(None, values)]:
-        if not np.all(np.isfinite(array)):
+        # False for NaN, too
+        if not np.all(np.abs(array) <= LARGEST_FLOAT32):
             which = name if key is None else f"{name} `{key}`"
             raise ValueError(
-                f"The environment returned a NaN or infinite {which} at environment step {timestep}: {array}. "
+                f"The environment returned a NaN or infinite (in float32) {which} at environment step {timestep}: {array}. "
                 "It was not stored, and the networks are as before it."
             )
 

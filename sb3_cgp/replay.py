@@ -1,40 +1,59 @@
-"""Off-policy algorithms whose loaded models allocate their replay buffer only when they train."""
+"""Off-policy algorithms that take no more memory for their replay buffer than they need."""
 
 import io
 import pathlib
 from typing import Any, TypeVar
 
+import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-SelfDeferredBufferAlgorithm = TypeVar("SelfDeferredBufferAlgorithm", bound="DeferredBufferAlgorithm")
+SelfLeanReplayAlgorithm = TypeVar("SelfLeanReplayAlgorithm", bound="LeanReplayAlgorithm")
 
 
-class DeferredBufferAlgorithm(OffPolicyAlgorithm):
+def float32_space(space: spaces.Space) -> spaces.Space:
     """
-    SB3's off-policy algorithm, save that a model which is loaded to be watched takes no memory for a million transitions.
+    Narrow a space's floating point numbers to float32, which the networks compute in.
 
-    rl_zoo3's ``enjoy`` and ``record_video`` see to that themselves, but only for a fixed list of algorithms.
+    :param space: an observation space
+    :return: the same space with float32 where it had more; other types stay as they are
+    """
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict({key: float32_space(subspace) for key, subspace in space.items()})
+    if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and space.dtype.itemsize > 4:
+        # Bounds beyond float32's are infinite in it
+        with np.errstate(over="ignore"):
+            return spaces.Box(space.low.astype(np.float32), space.high.astype(np.float32), dtype=np.float32)
+    return space
+
+
+class LeanReplayAlgorithm(OffPolicyAlgorithm):
+    """
+    SB3's off-policy algorithm, save for its replay buffer, of whichever class it is.
+
+    Observations are stored in float32 at most, as the networks compute in it: half the memory for MuJoCo's float64.
+    A model that is loaded to be watched takes no memory for a million transitions. rl_zoo3's ``enjoy`` and
+    ``record_video`` see to that themselves, but only for a fixed list of algorithms.
     """
 
     # Set by `load`, before the model is built
     _replay_buffer_deferred: bool = False
 
     def _setup_model(self) -> None:
-        buffer_size = self.buffer_size
-        if self._replay_buffer_deferred:
-            # SB3 allocates the buffer here: one row, until training asks for the others
-            self.buffer_size = 1
+        # SB3 allocates a buffer here that is not ours: one row of it
+        buffer_size, self.buffer_size = self.buffer_size, 1
         super()._setup_model()
-        if self._replay_buffer_deferred:
-            self.buffer_size, self.replay_buffer = buffer_size, None
+        self.buffer_size, self.replay_buffer = buffer_size, None
+        if not self._replay_buffer_deferred:
+            self._ensure_replay_buffer()
 
     def _ensure_replay_buffer(self) -> ReplayBuffer:
         """
-        Allocate the replay buffer that ``load`` left out, as SB3 does it.
+        Allocate the replay buffer if there is none, as SB3 does it.
 
         :return: the replay buffer
         """
@@ -45,7 +64,7 @@ class DeferredBufferAlgorithm(OffPolicyAlgorithm):
                 kwargs["env"] = self.env
             self.replay_buffer = self.replay_buffer_class(
                 self.buffer_size,
-                self.observation_space,
+                float32_space(self.observation_space),
                 self.action_space,
                 device=self.device,
                 n_envs=self.n_envs,
@@ -70,7 +89,7 @@ class DeferredBufferAlgorithm(OffPolicyAlgorithm):
 
     @classmethod
     def load(
-        cls: type[SelfDeferredBufferAlgorithm],
+        cls: type[SelfLeanReplayAlgorithm],
         path: str | pathlib.Path | io.BufferedIOBase,
         env: GymEnv | None = None,
         device: th.device | str = "auto",
@@ -78,7 +97,7 @@ class DeferredBufferAlgorithm(OffPolicyAlgorithm):
         print_system_info: bool = False,
         force_reset: bool = True,
         **kwargs: Any,
-    ) -> SelfDeferredBufferAlgorithm:
+    ) -> SelfLeanReplayAlgorithm:
         """
         Load the model from a zip-file, as SB3 does.
 

@@ -1,0 +1,149 @@
+"""The replay buffer: float32 in whichever of SB3's classes, and the same training as with float64."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import TD3, HerReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_cgp import CGP
+from sb3_cgp.replay import float32_space
+
+SMALL = dict(learning_starts=30, buffer_size=200, batch_size=8, cem_samples=8, cem_elites=2, seed=0)
+
+
+class Doubles(gym.Env):
+    """Random float64 observations, five steps an episode."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+    def observe(self):
+        return self.np_random.normal(size=3)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.steps += 1
+        return self.observe(), float(action.sum()), False, self.steps == 5, {}
+
+
+class Goals(Doubles):
+    """The same as a goal environment, with an image that is to stay as it is."""
+
+    observation_space = spaces.Dict(
+        observation=spaces.Box(-np.inf, np.inf, (3,), np.float64),
+        achieved_goal=spaces.Box(-np.inf, np.inf, (3,), np.float64),
+        desired_goal=spaces.Box(-np.inf, np.inf, (3,), np.float64),
+        image=spaces.Box(0, 255, (3, 36, 36), np.uint8),
+    )
+
+    def observe(self):
+        values = {key: super(Goals, self).observe() for key in ("observation", "achieved_goal", "desired_goal")}
+        return values | {"image": np.zeros((3, 36, 36), np.uint8)}
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return -np.linalg.norm(achieved_goal - desired_goal, axis=-1)
+
+
+def make_model(env, policy="MlpPolicy", **kwargs):
+    return CGP(policy, env, policy_kwargs=dict(net_arch=[8]), **(SMALL | kwargs))
+
+
+def parameters(model):
+    return th.cat([parameter.flatten() for parameter in model.policy.parameters()])
+
+
+def test_a_replay_of_mujoco_takes_half_the_memory_of_sb3s():
+    def bytes_of(buffer):
+        return buffer.observations.nbytes + buffer.next_observations.nbytes
+
+    env = gym.make("HalfCheetah-v5")
+    theirs = TD3("MlpPolicy", env, buffer_size=200).replay_buffer
+    ours = make_model(env).replay_buffer
+    assert type(ours) is type(theirs) is ReplayBuffer
+    assert bytes_of(ours) * 2 == bytes_of(theirs)
+
+
+VARIATIONS = {
+    "plain": (dict(), ReplayBuffer),
+    "n-step": (dict(n_steps=3), NStepReplayBuffer),
+    "memory": (
+        dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)),
+        ReplayBuffer,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", VARIATIONS)
+def test_training_is_the_same_to_the_bit_as_on_float64(monkeypatch, name):
+    kwargs, buffer_class = VARIATIONS[name]
+    narrow = make_model(Doubles(), **kwargs).learn(80)
+    monkeypatch.setattr("sb3_cgp.replay.float32_space", lambda space: space)
+    wide = make_model(Doubles(), **kwargs).learn(80)
+    assert narrow._n_updates == wide._n_updates == 50
+    assert type(narrow.replay_buffer) is buffer_class
+    assert (narrow.replay_buffer.observations.dtype, wide.replay_buffer.observations.dtype) == (np.float32, np.float64)
+    assert th.equal(parameters(narrow), parameters(wide))
+
+
+def test_vec_normalize_normalises_what_is_stored_narrowly():
+    env = VecNormalize(DummyVecEnv([Doubles]), gamma=0.99)
+    model = make_model(env).learn(80)
+    assert model.replay_buffer.observations.dtype == np.float32
+    normalised = env.normalize_obs(model.replay_buffer.observations[:80, 0])
+    batch = model.replay_buffer.sample(32, env=env).observations.numpy()
+    assert all(np.abs(normalised - row).max(axis=1).min() < 1e-6 for row in batch)
+
+
+@pytest.mark.parametrize("buffer_class", [DictReplayBuffer, HerReplayBuffer])
+def test_dict_and_hindsight_replay_narrow_what_is_float64_and_nothing_else(buffer_class):
+    model = make_model(Goals(), "MultiInputPolicy", replay_buffer_class=buffer_class).learn(60)
+    dtypes = {key: array.dtype for key, array in model.replay_buffer.observations.items()}
+    assert dtypes.pop("image") == np.uint8
+    assert set(dtypes.values()) == {np.dtype(np.float32)}
+    assert model._n_updates == 30
+
+
+def test_the_buffer_is_sb3s_own_for_whoever_loads_it(tmp_path):
+    env = Doubles()
+    make_model(env).learn(60).save_replay_buffer(tmp_path / "buffer")
+    td3 = TD3("MlpPolicy", env, learning_starts=0, seed=0)
+    td3.load_replay_buffer(tmp_path / "buffer")
+    assert td3.replay_buffer.size() == 60
+    td3.learn(10)
+
+
+def test_a_buffer_that_was_saved_in_float64_still_trains(tmp_path):
+    TD3("MlpPolicy", Doubles(), buffer_size=200, learning_starts=100).learn(60).save_replay_buffer(tmp_path / "buffer")
+    model = make_model(Doubles())
+    model.load_replay_buffer(tmp_path / "buffer")
+    model.learn(60)
+    assert model.replay_buffer.observations.dtype == np.float64
+    assert model._n_updates == 30
+
+
+@pytest.mark.parametrize("kind", ["observation", "reward"])
+def test_a_value_that_float32_cannot_hold_stops_the_training(kind):
+    class Huge(Doubles):
+        def step(self, action):
+            observation, reward, *rest = super().step(action)
+            if self.steps == 3:
+                observation, reward = (observation * 1e40, reward) if kind == "observation" else (observation, -1e40)
+            return observation, reward, *rest
+
+    with pytest.raises(ValueError, match=rf"infinite \(in float32\) {kind} at environment step 3"):
+        make_model(Huge()).learn(10)
+
+
+def test_spaces_keep_their_shape_and_their_bounds_where_float32_has_them():
+    narrow = float32_space(spaces.Box(np.array([-1e300, 0.0]), np.array([1e300, 0.5]), dtype=np.float64))
+    assert narrow == spaces.Box(np.array([-np.inf, 0.0], np.float32), np.array([np.inf, 0.5], np.float32))
+    for space in (spaces.Box(0, 255, (4,), np.uint8), spaces.Discrete(3), spaces.Box(-1, 1, (2,), np.float32)):
+        assert float32_space(space) is space
