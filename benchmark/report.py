@@ -8,8 +8,6 @@ and writes ``learning_curve.png`` and ``report.json`` into the run's folder.
 import argparse
 import importlib
 import io
-import json
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -31,6 +29,7 @@ from stable_baselines3.common.monitor import get_monitor_files, load_results
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from benchmark.files import write_atomically, write_json
 from benchmark.provenance import machine, package_versions
 
 # Far from the seeds that people train with: rl_zoo3 gives the training's environments the run's own
@@ -304,21 +303,6 @@ def draw_curve(record: dict[str, Any]) -> bytes:
     return picture.getvalue()
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """
-    Write a file so that whoever looks sees the old one or the new one, never a part.
-
-    :param path: the file
-    :param content: what it shall hold
-    """
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        beside.write_bytes(content)
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
-
-
 def report(run: Run, episodes: int, seed: int) -> dict[str, Any]:
     """
     Evaluate a run and write its learning curve and its record into its folder.
@@ -339,7 +323,7 @@ def report(run: Run, episodes: int, seed: int) -> dict[str, Any]:
     record = build_record(run, model, read_curve(run.folder), returns, seed)
     write_atomically(run.folder / "learning_curve.png", draw_curve(record))
     # Hyperparameters may be any Python object; NumPy's float64 is a float already
-    write_atomically(run.folder / "report.json", (json.dumps(record, indent=2, default=str) + "\n").encode())
+    write_json(run.folder / "report.json", record)
     return record
 
 

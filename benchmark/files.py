@@ -1,0 +1,44 @@
+"""Writing results: whole files or none, and Markdown for people beside JSON for programs."""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """
+    Write a file so that whoever looks sees the old one or the new one, never a part.
+
+    :param path: the file
+    :param content: what it shall hold
+    """
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        beside.write_bytes(content)
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def write_json(path: Path, record: dict[str, Any]) -> None:
+    """
+    Write a record.
+
+    :param path: the file
+    :param record: what it shall hold; what JSON does not know is written as a string
+    """
+    write_atomically(path, (json.dumps(record, indent=2, default=str) + "\n").encode())
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """
+    Lay out a table, its first column to the left and the others to the right.
+
+    :param header: the columns' titles
+    :param rows: the cells of each row
+    :return: the table in Markdown
+    """
+    lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
