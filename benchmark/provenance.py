@@ -2,13 +2,26 @@
 
 import os
 import platform
+import shlex
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import torch as th
 
-PACKAGES = ("sb3-cgp", "rl_zoo3", "stable_baselines3", "sb3_contrib", "torch", "gymnasium", "mujoco", "numpy")
+PACKAGES = (
+    "sb3-cgp",
+    "rl_zoo3",
+    "stable_baselines3",
+    "sb3_contrib",
+    "sbx-rl",
+    "torch",
+    "jax",
+    "gymnasium",
+    "mujoco",
+    "numpy",
+)
 
 
 def package_versions() -> dict[str, str | None]:
@@ -46,13 +59,49 @@ def machine(device: th.device) -> dict[str, Any]:
     Describe the hardware in use.
 
     :param device: where the networks live
-    :return: operating system, processor, cores, PyTorch's threads, device and the GPU's name if it is one
+    :return: operating system, processor and its instruction set, cores, PyTorch's threads, device, and the GPU's name
     """
     return {
         "system": platform.platform(),
         "cpu": cpu_model(),
+        "cpu_capability": th.backends.cpu.get_cpu_capability(),
         "cores": os.cpu_count(),
         "torch_threads": th.get_num_threads(),
         "device": str(device),
         "gpu": th.cuda.get_device_name(device) if device.type == "cuda" else None,
     }
+
+
+def conditions(module: str, argv: Sequence[str], device: th.device) -> dict[str, Any]:
+    """
+    Describe how a command measures.
+
+    :param module: the command's module
+    :param argv: its arguments
+    :param device: where it computes
+    :return: the command line, the versions, the hardware, and how many other processes wanted the processor just before
+    """
+    return {
+        "command": shlex.join(["python", "-m", module, *argv]),
+        "versions": package_versions(),
+        "machine": machine(device),
+        # Windows has no such figure
+        "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+    }
+
+
+def conditions_in_words(record: dict[str, Any]) -> str:
+    """
+    Say on two lines how a command measured.
+
+    :param record: holds what :func:`conditions` gave
+    :return: the lines, in Markdown
+    """
+    hardware = record["machine"]
+    place = hardware["gpu"] or hardware["device"]
+    threads = f"{hardware['torch_threads']} thread" + "s" * (hardware["torch_threads"] > 1)
+    versions = ", ".join(f"{package} {version}" for package, version in record["versions"].items() if version is not None)
+    return (
+        f"`{record['command']}` on {hardware['cpu']} ({hardware['cpu_capability']}, {hardware['cores']} cores), "
+        f"{threads}, networks on {place}, load average before the start {record['load_average']}.\n\n{versions}."
+    )

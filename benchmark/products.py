@@ -1,0 +1,94 @@
+"""
+The arithmetic of one CEM call, and the bare matrix products that it cannot do without: the floor under its time.
+
+Shapes: B states, N samples per state, A action dimensions, F features, H units of each of two hidden layers.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch as th
+
+# Rows of the blocks that are tried besides the whole: on a CPU, a block that stays in cache is often faster
+BLOCK_ROWS = (256, 1024, 2048)
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """
+    The sizes of one CEM call, by default the paper's on HalfCheetah.
+
+    :param batch: states, B
+    :param samples: samples per state and iteration, N
+    :param iterations: iterations of CEM
+    :param action_dim: action dimensions, A
+    :param width: units of each of the two hidden layers, H
+    :param n_features: features of a state, F
+    """
+
+    batch: int = 128
+    samples: int = 64
+    iterations: int = 2
+    action_dim: int = 6
+    width: int = 256
+    n_features: int = 17
+
+    @property
+    def actions(self) -> int:
+        """Actions scored in one iteration."""
+        return self.batch * self.samples
+
+
+def call_flops(sizes: Sizes) -> int:
+    """
+    Count a CEM call's useful floating-point operations: those of the critic's matrix products, a multiplication and an
+    addition each, with the states' part of the first layer computed once. Sampling, activations and sorting are not counted.
+
+    :param sizes: the call's sizes
+    :return: the operations
+    """
+    per_state = sizes.n_features * sizes.width
+    per_action = sizes.action_dim * sizes.width + sizes.width**2 + sizes.width
+    return 2 * (sizes.batch * per_state + sizes.iterations * sizes.actions * per_action)
+
+
+def product_flops(sizes: Sizes) -> int:
+    """
+    Count the operations of the bare products: (B N, H) times (H, H) once per iteration, from hidden layer to hidden layer.
+
+    :param sizes: the call's sizes
+    :return: the operations
+    """
+    return 2 * sizes.iterations * sizes.actions * sizes.width**2
+
+
+def bare_products(sizes: Sizes, dtype: th.dtype, device: th.device) -> dict[str, Callable[[], object]]:
+    """
+    Make the bare products of a CEM call, in one piece and in blocks that are reused, so that they stay in cache.
+
+    Operands and results are allocated here, once: nothing but the products is left to time.
+
+    :param sizes: the call's sizes
+    :param dtype: the data type
+    :param device: where to compute
+    :return: the functions to time, by name; the fastest is the floor
+    """
+    ways = {"whole": sizes.actions}
+    ways.update({f"blocks of {rows} rows": rows for rows in BLOCK_ROWS if rows < sizes.actions})
+    return {name: _product(sizes, rows, dtype, device) for name, rows in ways.items()}
+
+
+def _product(sizes: Sizes, rows: int, dtype: th.dtype, device: th.device) -> Callable[[], object]:
+    weight = th.randn(sizes.width, sizes.width, device=device).to(dtype).t()
+    block = th.randn(rows, sizes.width, device=device).to(dtype)
+    result = th.empty_like(block)
+    whole_blocks, rest = divmod(sizes.actions, rows)
+
+    def run() -> None:
+        for _ in range(sizes.iterations):
+            for _ in range(whole_blocks):
+                th.mm(block, weight, out=result)
+            if rest > 0:
+                th.mm(block[:rest], weight, out=result[:rest])
+
+    return run

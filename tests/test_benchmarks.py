@@ -1,0 +1,285 @@
+"""The measuring commands: what they time, what they count, and what they write. Times themselves are not tested."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+
+from benchmark import arguments, contenders, products, runtime, selector
+from benchmark.plain import PlainPolicy
+from benchmark.products import Sizes
+from benchmark.timing import interleaved, ratio, summary, timed
+from sb3_cgp import CGP
+
+CPU = th.device("cpu")
+COMMANDS = {"runtime": runtime, "selector": selector}
+
+
+def test_turns_rotate_and_the_burn_in_is_not_timed():
+    calls = []
+    runs = {name: lambda name=name: calls.append(name) for name in "abc"}
+    seconds = interleaved(runs, rounds=3, burn_in=1)
+    assert "".join(calls) == "abc" + "bca" + "cab" + "abc"
+    assert {name: len(times) for name, times in seconds.items()} == {"a": 3, "b": 3, "c": 3}
+
+
+def test_seconds_are_those_of_the_call_and_in_the_order_of_the_rounds(monkeypatch):
+    clock, durations = [0.0], iter([9.0, 9.0, 1.0, 20.0, 40.0, 2.0])
+
+    def run():
+        clock[0] += next(durations)
+
+    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
+    # Rounds: a b (burn-in), b a, a b
+    assert interleaved({"a": run, "b": run}, rounds=2) == {"a": [20.0, 40.0], "b": [1.0, 2.0]}
+    assert timed(lambda: None) == 0.0
+
+
+def test_nothing_to_time_is_no_error():
+    assert interleaved({}, rounds=2) == {}
+
+
+def test_ratio_is_within_rounds():
+    # A slow first round hits both alike; the ratio of the medians would be 1.5
+    assert ratio([100.0, 2.0, 3.0], [50.0, 1.0, 2.0]) == 2.0
+    assert summary([4.0, 1.0, 2.0, 3.0, 5.0]) == {"median": 3.0, "lower": 2.0, "upper": 4.0, "all": [4.0, 1.0, 2.0, 3.0, 5.0]}
+
+
+def test_operations_agree_with_a_count_by_hand():
+    sizes = Sizes(batch=3, samples=5, iterations=2, action_dim=2, width=4, n_features=7)
+    # Once per state 7 x 4, for each of 2 x 15 actions 2 x 4 + 4 x 4 + 4 x 1; a multiplication and an addition each
+    assert products.call_flops(sizes) == 2 * (3 * 28 + 30 * 28)
+    assert products.product_flops(sizes) == 2 * 30 * 16
+    # The two big products of the default call
+    assert products.product_flops(Sizes()) == 2 * 2 * 8192 * 256 * 256
+
+
+@pytest.mark.parametrize("batch", [100, 6000])
+def test_bare_products_do_the_operations_that_are_counted(monkeypatch, batch):
+    sizes = Sizes(batch=batch, samples=1, iterations=3, width=4)
+    counted = []
+
+    def multiply(left, right, *, out):
+        assert out.shape == (left.shape[0], right.shape[1])
+        assert (left.dtype, right.dtype) == (th.bfloat16, th.bfloat16)
+        counted.append(2 * left.shape[0] * left.shape[1] * right.shape[1])
+
+    ways = products.bare_products(sizes, th.bfloat16, CPU)
+    monkeypatch.setattr(th, "mm", multiply)
+    assert len(ways) == (1 if batch == 100 else 4)
+    for run in ways.values():
+        counted.clear()
+        run()
+        assert sum(counted) == products.product_flops(sizes)
+
+
+def test_sizes_are_varied_one_at_a_time():
+    sizes = selector.sizes_to_measure(["batch", "width"])
+    assert sizes[0] == Sizes()
+    assert len(set(sizes)) == len(sizes) == 1 + 4 + 4
+    assert {(size.batch, size.width) for size in sizes} == {
+        *((batch, 256) for batch in (1, 32, 128, 256, 512)),
+        *((128, width) for width in (64, 128, 256, 512, 1024)),
+    }
+
+
+def test_plain_policy_selects_what_the_fast_one_selects():
+    env = make_vec_env("Pendulum-v1", seed=0)
+    fast, plain = (CGP(policy, env, buffer_size=10, seed=0) for policy in ("MlpPolicy", PlainPolicy))
+    plain.set_parameters(fast.get_parameters())
+    observations = th.randn(20, 3)
+    selections = []
+    for model in (fast, plain):
+        th.manual_seed(7)
+        selections.append(model.policy.select_actions(observations, model.critic))
+    th.testing.assert_close(selections[0].actions, selections[1].actions, rtol=1e-4, atol=1e-4)
+    th.testing.assert_close(selections[0].spread, selections[1].spread, rtol=1e-4, atol=1e-4)
+
+
+def test_plain_policy_repeats_every_observation():
+    model = CGP(PlainPolicy, make_vec_env("Pendulum-v1"), buffer_size=10, cem_samples=8, cem_iterations=3)
+    rows = []
+    first = model.critic.q_networks[0][0]
+    first.register_forward_hook(lambda layer, inputs, output: rows.append(inputs[0].shape))
+    model.policy.select_actions(th.randn(5, 3), model.critic)
+    assert rows == [(5 * 8, 3 + 1)] * 3
+
+
+def run_command(name: str, folder: Path, *options: str) -> dict:
+    """Run a command, and read the record that it writes."""
+    COMMANDS[name].main([*options, "--folder", str(folder)])
+    assert not list(folder.glob(".*")), "an unfinished file was left behind"
+    return json.loads((folder / f"{name}.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def runtime_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run-time table of a few methods, without SBX, on episodes of a few steps."""
+    th.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("runtime")
+    options = "--env Pendulum-v1 --episode-steps 6 --episodes 3 --inference-episodes 4 --seed 5"
+    with pytest.MonkeyPatch.context() as patch:
+        # What Python puts there for a module that shall not be found
+        patch.setitem(sys.modules, "sbx", None)
+        methods = ["Random", "SAC", "TD3", "CEM-2", "CGP-2", "CGP-2-plain", "SBX-TD3"]
+        run_command("runtime", folder, *options.split(), "--methods", *methods)
+    return folder
+
+
+def test_runtime_ratios_follow_from_the_seconds(runtime_folder):
+    methods = json.loads((runtime_folder / "runtime.json").read_text())["methods"]
+    for phase, rounds in (("train", 3), ("inference", 4)):
+        reference = methods["TD3"][phase]["seconds"]["all"]
+        assert methods["TD3"][phase]["ratio"] == 1.0
+        for name in ("SAC", "CEM-2", "CGP-2", "CGP-2-plain"):
+            seconds = methods[name][phase]["seconds"]
+            assert len(seconds["all"]) == rounds
+            assert min(seconds["all"]) > 0.0
+            assert seconds["median"] == pytest.approx(np.median(seconds["all"]))
+            ratios = sorted(mine / td3 for mine, td3 in zip(seconds["all"], reference, strict=True))
+            assert methods[name][phase]["ratio"] == pytest.approx((ratios[(rounds - 1) // 2] + ratios[rounds // 2]) / 2)
+
+
+def test_timed_episodes_make_one_gradient_step_per_environment_step(runtime_folder):
+    methods = json.loads((runtime_folder / "runtime.json").read_text())["methods"]
+    for name in ("SAC", "TD3", "CEM-2", "CGP-2", "CGP-2-plain"):
+        assert methods[name]["timed_gradient_steps"] == 3 * 6, name
+
+
+def test_runtime_table_says_what_was_measured(runtime_folder):
+    record = json.loads((runtime_folder / "runtime.json").read_text())
+    text = (runtime_folder / "runtime.md").read_text()
+    lines = [[cell.strip() for cell in line.split("|")] for line in text.splitlines() if line.startswith("|")]
+    rows = {name: cells for _, name, *cells, _ in lines}
+    assert rows["Random"][:3] == ["-", "-", "-"]
+    assert rows["Random"][5] == "0.20"
+    assert rows["TD3"][1:3] == ["1.00", "1.00"]
+    assert rows["CGP-2"][1:3] == [f"{record['methods']['CGP-2']['train']['ratio']:.2f}", "1.95"]
+    assert rows["CEM-2"][4:] == [f"{record['methods']['CEM-2']['inference']['ratio']:.2f}", "2.68"]
+    assert rows["SBX-TD3"][0] == record["methods"]["SBX-TD3"]["missing"]
+    assert re.match("not measured: .*sbx", rows["SBX-TD3"][0])
+    assert "CGP-4" not in rows
+    assert (record["env"], record["episode_steps"], record["seed"]) == ("Pendulum-v1", 6, 5)
+    assert record["versions"]["torch"] == th.__version__
+    assert record["machine"]["torch_threads"] == 1
+    assert record["command"].startswith("python -m benchmark.runtime --env Pendulum-v1 ")
+    assert record["command"] in text
+
+
+def test_without_td3_there_are_no_ratios(tmp_path):
+    options = "--env Pendulum-v1 --episode-steps 2 --episodes 1 --inference-episodes 1 --methods DDPG"
+    record = run_command("runtime", tmp_path, *options.split())
+    assert record["methods"]["DDPG"]["train"]["ratio"] is None
+    assert "| - | 1.01 |" in (tmp_path / "runtime.md").read_text()
+
+
+def test_every_contender_has_the_same_batch_and_network():
+    env = make_vec_env("Pendulum-v1")
+    for name, contender in contenders.CONTENDERS.items():
+        if contender.package in (None, "sbx"):
+            continue
+        model = contenders.make_agent(name, env, learning_starts=1, seed=0, device=CPU)
+        widths = [layer.out_features for layer in model.actor.modules() if isinstance(layer, th.nn.Linear)]
+        assert widths[:2] == [256, 256], name
+        networks = getattr(model.critic, "quantile_critics", None) or model.critic.q_networks
+        assert len(networks) == (1 if name == "DDPG" else 2), name
+        for network in networks:
+            widths = [layer.out_features for layer in network.modules() if isinstance(layer, th.nn.Linear)]
+            assert widths[:-1] == [256, 256], name
+        assert (model.batch_size, model.gradient_steps, model.train_freq.frequency) == (128, 1, 1), name
+        if contender.algorithm == "CGP":
+            assert model.cem_iterations == int(name[4]), name
+            assert model.policy.inference == ("cem" if name.startswith("CEM") else "actor"), name
+
+
+def test_data_type_goes_to_the_methods_that_score_by_the_fast_way(tmp_path, monkeypatch):
+    given = {}
+    monkeypatch.setattr(runtime, "make_agent", lambda name, *args, **kwargs: given.update({name: kwargs}))
+    methods = ["TD3", "CEM-4", "CGP-2", "CGP-2-plain"]
+    options = f"--env Pendulum-v1 --cem-dtype float32 --folder {tmp_path}"
+    args = runtime.parse([*options.split(), "--methods", *methods])
+    runtime.make_agents(args)
+    float32 = {"cem_dtype": "float32"}
+    assert given == {"TD3": {}, "CEM-4": float32, "CGP-2": float32, "CGP-2-plain": {}}
+
+
+def test_inference_acts_deterministically_for_as_many_steps_as_asked():
+    asked = []
+
+    class Agent(contenders.RandomAgent):
+        def predict(self, observation, deterministic=False):
+            asked.append((observation.copy(), deterministic))
+            return super().predict(observation, deterministic)
+
+    episode = runtime.inference_episode(Agent(make_vec_env("Pendulum-v1")), "Pendulum-v1", seed=0, steps=4)
+    episode()
+    episode()
+    assert [deterministic for _, deterministic in asked] == [True] * 8
+    # It goes on where it was, rather than from the same start
+    assert len({observation.tobytes() for observation, _ in asked}) == 8
+
+
+def test_selector_writes_what_follows_from_the_seconds(tmp_path):
+    record = run_command("selector", tmp_path, "--rounds", "2", "--dtypes", "float32", "--vary")
+    (entry,) = record["calls"]
+    assert entry["sizes"] == {"batch": 128, "samples": 64, "iterations": 2, "action_dim": 6, "width": 256, "n_features": 17}
+    call, plain = entry["call_seconds"]["all"], entry["plain_seconds"]["all"]
+    assert len(call) == len(plain) == 2
+    assert entry["ratio_to_plain"] == pytest.approx((call[0] / plain[0] + call[1] / plain[1]) / 2)
+    assert entry["flops_per_second"] == pytest.approx(entry["call_flops"] / np.mean(call))
+    medians = {way: product["median"] for way, product in entry["product_seconds"].items()}
+    assert len(medians) == 4
+    floor = entry["fastest_product"]
+    assert medians[floor] == min(medians.values())
+    fastest = entry["product_seconds"][floor]["all"]
+    assert entry["share_of_products"] == pytest.approx((fastest[0] / call[0] + fastest[1] / call[1]) / 2)
+    row = next(line for line in (tmp_path / "selector.md").read_text().splitlines() if "128 × 64 × 2" in line)
+    assert f"| {entry['ratio_to_plain']:.2f} |" in row
+    assert f"| {entry['share_of_products']:.0%} |" in row
+
+
+def test_selector_asks_for_the_data_type(monkeypatch):
+    asked = []
+    monkeypatch.setattr(selector, "q_score", lambda network, features, **kwargs: asked.append(kwargs))
+    selector.fast_score("float32")(None, None)
+    selector.fast_score("bfloat16")(None, None)
+    assert asked == [{}, {"dtype": th.bfloat16}]
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("runtime", "--episodes 0", "argument --episodes: '0' is not an integer >= 1"),
+        ("runtime", "--episode-steps 1.5", "argument --episode-steps: '1.5' is not an integer >= 1"),
+        ("runtime", "--methods PPO", "argument --methods: invalid choice: 'PPO'"),
+        ("runtime", "--env Nowhere-v0", "argument --env: 'Nowhere-v0' cannot be made"),
+        ("runtime", "--env CartPole-v1", "argument --env: 'CartPole-v1' has no continuous actions"),
+        ("selector", "--dtypes int8", "argument --dtypes: invalid choice: 'int8'"),
+        ("selector", "--threads -1", "argument --threads: '-1' is not an integer >= 1"),
+        ("selector", "--device abacus", "argument --device: 'abacus' is not available"),
+    ],
+)
+def test_bad_arguments_are_named(tmp_path, capsys, name, options, message):
+    with pytest.raises(SystemExit):
+        COMMANDS[name].parse([*options.split(), "--folder", str(tmp_path)])
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.skipif(th.cuda.is_available(), reason="there is a GPU")
+def test_missing_gpu_is_not_replaced_quietly(capsys):
+    with pytest.raises(SystemExit):
+        selector.parse(["--device", "cuda"])
+    assert "argument --device: 'cuda' is not available" in capsys.readouterr().err
+    assert arguments.device("auto") == CPU
+
+
+def test_folder_that_cannot_be_made_is_named_before_anything_is_measured(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit):
+        selector.parse(["--folder", str(tmp_path / "file" / "folder")])
+    assert "argument --folder: " in capsys.readouterr().err
