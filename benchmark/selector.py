@@ -38,8 +38,8 @@ over the call's. Both are medians of the ratios within each round.
 
 The bare products are the multiplications of the hidden activations, (batch × samples, width), by the second layer's weights,
 (width, width), once per iteration and in the same data type: not the first layer, not the last, no activation. Their
-operands lie ready, and of one piece and several block sizes the fastest counts. GFLOP/s counts all the critic's products:
-a state's part of the first layer once, everything else once per sampled action."""
+operands lie ready; of PyTorch's kernels, in one piece and in blocks of several sizes, the fastest counts. GFLOP/s counts
+all the critic's products: a state's part of the first layer once, everything else once per sampled action."""
 
 
 def sizes_to_measure(varied: Sequence[str]) -> list[Sizes]:

@@ -67,18 +67,26 @@ def test_bare_products_do_the_operations_that_are_counted(monkeypatch, batch):
     sizes = Sizes(batch=batch, samples=1, iterations=3, width=4)
     counted = []
 
-    def multiply(left, right, *, out):
-        assert out.shape == (left.shape[0], right.shape[1])
-        assert (left.dtype, right.dtype) == (th.bfloat16, th.bfloat16)
-        counted.append(2 * left.shape[0] * left.shape[1] * right.shape[1])
+    def multiply(left, weight, result):
+        assert (left.dtype, weight.dtype) == (th.bfloat16, th.bfloat16)
+        assert weight.shape == (4, 4)
+        counted.append(2 * left.shape[0] * left.shape[1] * weight.shape[0])
 
+    monkeypatch.setattr(products, "kernels", lambda device: {"kernel": multiply})
     ways = products.bare_products(sizes, th.bfloat16, CPU)
-    monkeypatch.setattr(th, "mm", multiply)
     assert len(ways) == (1 if batch == 100 else 4)
     for run in ways.values():
         counted.clear()
         run()
         assert sum(counted) == products.product_flops(sizes)
+
+
+@pytest.mark.parametrize("dtype", [th.float32, th.bfloat16])
+def test_every_kernel_multiplies_by_the_transposed_weights(dtype):
+    left, weight, result = th.randn(5, 8).to(dtype), th.randn(8, 8).to(dtype), th.empty(5, 8, dtype=dtype)
+    for name, multiply in products.kernels(CPU).items():
+        product = multiply(left, weight, result)
+        th.testing.assert_close(product.float(), left.float() @ weight.float().t(), rtol=1e-2, atol=1e-1, msg=name)
 
 
 def test_sizes_are_varied_one_at_a_time():
@@ -95,6 +103,7 @@ def test_plain_policy_selects_what_the_fast_one_selects():
     env = make_vec_env("Pendulum-v1", seed=0)
     fast, plain = (CGP(policy, env, buffer_size=10, seed=0) for policy in ("MlpPolicy", PlainPolicy))
     plain.set_parameters(fast.get_parameters())
+    fast.policy.cem_dtype = "float32"
     observations = th.randn(20, 3)
     selections = []
     for model in (fast, plain):
@@ -236,7 +245,7 @@ def test_selector_writes_what_follows_from_the_seconds(tmp_path):
     assert entry["ratio_to_plain"] == pytest.approx((call[0] / plain[0] + call[1] / plain[1]) / 2)
     assert entry["flops_per_second"] == pytest.approx(entry["call_flops"] / np.mean(call))
     medians = {way: product["median"] for way, product in entry["product_seconds"].items()}
-    assert len(medians) == 4
+    assert len(medians) == 4 * len(products.kernels(CPU))
     floor = entry["fastest_product"]
     assert medians[floor] == min(medians.values())
     fastest = entry["product_seconds"][floor]["all"]
