@@ -64,6 +64,31 @@ def product_flops(sizes: Sizes) -> int:
     return 2 * sizes.iterations * sizes.actions * sizes.width**2
 
 
+def outer_products(sizes: Sizes, device: th.device) -> Callable[[], object]:
+    """
+    Make the call's other products, all in float32: the states' part of the first layer once; per iteration the actions' part,
+    (B N, A) times (A, H), and the last layer, (B N, H) times (H, 1). Operands and results are allocated here, once.
+
+    :param sizes: the call's sizes
+    :param device: where to compute
+    :return: the function to time
+    """
+
+    def operands(rows: int, inner: int, columns: int) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        left, right = th.randn(rows, inner, device=device), th.randn(inner, columns, device=device)
+        return left, right, th.empty(rows, columns, device=device)
+
+    states = operands(sizes.batch, sizes.n_features, sizes.width)
+    each_iteration = [operands(sizes.actions, sizes.action_dim, sizes.width), operands(sizes.actions, sizes.width, 1)]
+
+    @th.no_grad()
+    def run() -> None:
+        for left, right, result in [states, *each_iteration * sizes.iterations]:
+            th.mm(left, right, out=result)
+
+    return run
+
+
 def kernels(device: th.device) -> dict[str, Kernel]:
     """
     List the ways of multiplying that are worth trying: which is the fastest differs between processors.

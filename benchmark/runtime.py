@@ -192,10 +192,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     record = {
         **conditions("benchmark.runtime", argv, args.device),
-        **{
-            name: getattr(args, name)
-            for name in ("env", "seed", "episode_steps", "episodes", "inference_episodes", "cem_dtype")
-        },
+        **{name: getattr(args, name) for name in RECORDED},
         "burn_in_steps": burn_in_steps(args.episode_steps),
         "methods": measure(args),
     }

@@ -8,6 +8,7 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import torch as th
@@ -16,7 +17,7 @@ from torch import nn
 
 from benchmark.arguments import count, measuring_parser
 from benchmark.files import markdown_table, write_atomically, write_json
-from benchmark.products import Sizes, bare_products, call_flops, product_flops
+from benchmark.products import Sizes, bare_products, call_flops, outer_products, product_flops
 from benchmark.provenance import conditions, conditions_in_words
 from benchmark.timing import interleaved, ratio, summary
 from sb3_cgp.cem import CEM, Score
@@ -36,10 +37,11 @@ calls, everything in the table taken in turn; one size is varied at a time aroun
 to the same call with the observation repeated for every sample in float32; "of products" the time of the bare products
 over the call's. Both are medians of the ratios within each round.
 
-The bare products are the multiplications of the hidden activations, (batch × samples, width), by the second layer's weights,
-(width, width), once per iteration and in the same data type: not the first layer, not the last, no activation. Their
-operands lie ready; of PyTorch's kernels, in one piece and in blocks of several sizes, the fastest counts. GFLOP/s counts
-all the critic's products: a state's part of the first layer once, everything else once per sampled action."""
+The bare products are all the critic's: hidden activations, (batch × samples, width), by the second layer's weights,
+(width, width), once per iteration and in the same data type; and in float32 the first layer's parts for states (once)
+and actions, and the last layer. Operands lie ready and no activation is applied. For the hidden ones the fastest of
+PyTorch's kernels counts, in one piece and in blocks of several sizes; "of hidden" is their share alone. GFLOP/s counts the
+same products."""
 
 
 def sizes_to_measure(varied: Sequence[str]) -> list[Sizes]:
@@ -73,18 +75,6 @@ def cem_call(sizes: Sizes, make_score: Callable[[nn.Module, th.Tensor], Score], 
     return run
 
 
-def fast_score(dtype: str) -> Callable[[nn.Module, th.Tensor], Score]:
-    """
-    Choose our way of scoring.
-
-    :param dtype: the data type of the hidden layers
-    :return: makes the scoring function
-    """
-    # float32 is the default
-    settings: dict[str, Any] = {} if dtype == "float32" else {"dtype": DTYPES[dtype]}
-    return lambda q_network, features: q_score(q_network, features, **settings)
-
-
 def measure(args: argparse.Namespace) -> list[dict[str, Any]]:
     """
     Measure all the calls asked for.
@@ -97,8 +87,9 @@ def measure(args: argparse.Namespace) -> list[dict[str, Any]]:
     runs: dict[tuple[Sizes, str, str], Callable[[], object]] = {}
     for sizes in all_sizes:
         runs[sizes, "plain", ""] = cem_call(sizes, repeated_q_score, args.device)
+        runs[sizes, "outer", ""] = outer_products(sizes, args.device)
         for dtype in args.dtypes:
-            runs[sizes, dtype, "call"] = cem_call(sizes, fast_score(dtype), args.device)
+            runs[sizes, dtype, "call"] = cem_call(sizes, partial(q_score, dtype=DTYPES[dtype]), args.device)
             for way, product in bare_products(sizes, DTYPES[dtype], args.device).items():
                 runs[sizes, dtype, way] = product
     seconds = interleaved(runs, args.rounds, device=args.device, title="selector")
@@ -108,6 +99,7 @@ def measure(args: argparse.Namespace) -> list[dict[str, Any]]:
             dtype,
             seconds[sizes, dtype, "call"],
             seconds[sizes, "plain", ""],
+            seconds[sizes, "outer", ""],
             {key[2]: times for key, times in seconds.items() if key[:2] == (sizes, dtype) and key[2] != "call"},
         )
         for sizes in all_sizes
@@ -116,7 +108,7 @@ def measure(args: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def figures(
-    sizes: Sizes, dtype: str, call: list[float], plain: list[float], products: dict[str, list[float]]
+    sizes: Sizes, dtype: str, call: list[float], plain: list[float], outer: list[float], products: dict[str, list[float]]
 ) -> dict[str, Any]:
     """
     Put together what is known of one call.
@@ -125,6 +117,7 @@ def figures(
     :param dtype: the data type of the hidden layers
     :param call: its seconds, by round
     :param plain: the plain way's
+    :param outer: those of the products of the first and the last layer
     :param products: the bare products', by way
     :return: seconds, speeds and ratios
     """
@@ -143,7 +136,9 @@ def figures(
         "product_seconds": summaries,
         "fastest_product": floor,
         "product_flops_per_second": product_flops(sizes) / summaries[floor]["median"],
-        "share_of_products": ratio(products[floor], call),
+        "outer_product_seconds": summary(outer),
+        "share_of_products": ratio([first + second for first, second in zip(products[floor], outer, strict=True)], call),
+        "share_of_hidden_products": ratio(products[floor], call),
     }
 
 
@@ -154,7 +149,18 @@ def markdown(record: dict[str, Any]) -> str:
     :param record: what was measured, and how
     :return: the table and its notes, in Markdown
     """
-    header = ["batch × samples × iterations", "actions", "width", "type", "ms", "plain", "/ plain", "GFLOP/s", "of products"]
+    header = [
+        "batch × samples × iterations",
+        "actions",
+        "width",
+        "type",
+        "ms",
+        "plain",
+        "/ plain",
+        "GFLOP/s",
+        "of products",
+        "of hidden",
+    ]
     rows = []
     for entry in record["calls"]:
         sizes = entry["sizes"]
@@ -169,6 +175,7 @@ def markdown(record: dict[str, Any]) -> str:
                 f"{entry['ratio_to_plain']:.2f}",
                 f"{entry['flops_per_second'] / 1e9:.3g}",
                 f"{entry['share_of_products']:.0%}",
+                f"{entry['share_of_hidden_products']:.0%}",
             ]
         )
     notes = NOTES.format(n_features=Sizes().n_features, rounds=record["rounds"])

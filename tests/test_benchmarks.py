@@ -18,6 +18,7 @@ from benchmark.plain import PlainPolicy
 from benchmark.products import Sizes
 from benchmark.timing import interleaved, ratio, summary, timed
 from sb3_cgp import CGP
+from sb3_cgp.scoring import repeated_q_score
 
 CPU = th.device("cpu")
 COMMANDS = {"runtime": runtime, "selector": selector, "scaling": scaling}
@@ -249,18 +250,39 @@ def test_selector_writes_what_follows_from_the_seconds(tmp_path):
     floor = entry["fastest_product"]
     assert medians[floor] == min(medians.values())
     fastest = entry["product_seconds"][floor]["all"]
-    assert entry["share_of_products"] == pytest.approx((fastest[0] / call[0] + fastest[1] / call[1]) / 2)
+    outer = entry["outer_product_seconds"]["all"]
+    assert entry["share_of_hidden_products"] == pytest.approx((fastest[0] / call[0] + fastest[1] / call[1]) / 2)
+    shares = [(fastest[turn] + outer[turn]) / call[turn] for turn in range(2)]
+    assert entry["share_of_products"] == pytest.approx(sum(shares) / 2)
     row = next(line for line in (tmp_path / "selector.md").read_text().splitlines() if "128 × 64 × 2" in line)
     assert f"| {entry['ratio_to_plain']:.2f} |" in row
     assert f"| {entry['share_of_products']:.0%} |" in row
 
 
-def test_selector_asks_for_the_data_type(monkeypatch):
-    asked = []
-    monkeypatch.setattr(selector, "q_score", lambda network, features, **kwargs: asked.append(kwargs))
-    selector.fast_score("float32")(None, None)
-    selector.fast_score("bfloat16")(None, None)
-    assert asked == [{}, {"dtype": th.bfloat16}]
+def test_selector_asks_for_the_data_type(tmp_path, monkeypatch):
+    asked = set()
+
+    def score(network, features, dtype):
+        asked.add(dtype)
+        return repeated_q_score(network, features)
+
+    monkeypatch.setattr(selector, "q_score", score)
+    run_command("selector", tmp_path, "--rounds", "1", "--dtypes", "bfloat16", "--vary")
+    assert asked == {th.bfloat16}
+
+
+@pytest.mark.parametrize("sizes", [Sizes(), Sizes(batch=5, samples=3, iterations=4, action_dim=2, width=8, n_features=7)])
+def test_outer_and_hidden_products_are_all_that_a_call_multiplies(monkeypatch, sizes):
+    counted = []
+
+    def multiply(left, right, out):
+        assert (left.dtype, out.shape) == (th.float32, (left.shape[0], right.shape[1]))
+        counted.append(2 * left.shape[0] * left.shape[1] * right.shape[1])
+
+    run = products.outer_products(sizes, CPU)
+    monkeypatch.setattr(th, "mm", multiply)
+    run()
+    assert sum(counted) + products.product_flops(sizes) == products.call_flops(sizes)
 
 
 def test_scaling_draws_what_it_measures(tmp_path, monkeypatch):
