@@ -76,12 +76,13 @@ def output_folder(text: str) -> Path:
     return folder
 
 
-def measuring_parser(name: str, description: str) -> argparse.ArgumentParser:
+def measuring_parser(name: str, description: str, with_seed: bool = True) -> argparse.ArgumentParser:
     """
     Start the parser of a command that measures.
 
     :param name: the command's module within ``benchmark``
     :param description: what the command does
+    :param with_seed: whether it takes one seed; not if it takes several
     :return: the parser, with the arguments that all such commands take
     """
     parser = argparse.ArgumentParser(prog=f"python -m benchmark.{name}", description=description)
@@ -91,6 +92,7 @@ def measuring_parser(name: str, description: str) -> argparse.ArgumentParser:
 
     add("--threads", count, 1, "PyTorch's threads")
     add("--device", device, "auto", "where the networks compute")
-    add("--seed", int, 0, "seed of the random numbers")
+    if with_seed:
+        add("--seed", int, 0, "seed of the random numbers")
     add("--folder", output_folder, f"benchmark/results/{name}", "where the results go")
     return parser
