@@ -1,5 +1,6 @@
 """Cross-Entropy Guided Policies: the arguments, acting, and training in the order of the paper's Algorithm 2."""
 
+from collections.abc import Hashable
 from functools import partial
 from typing import Any, ClassVar, TypeVar
 
@@ -8,24 +9,24 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import (
     FloatSchedule,
     LinearSchedule,
     configure_logger,
     get_parameters_by_name,
     polyak_update,
-    update_learning_rate,
 )
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.td3.policies import Actor
 
+from sb3_cgp.captured import set_learning_rate
 from sb3_cgp.cem import CEM
 from sb3_cgp.diagnostics import policy_diagnostics
+from sb3_cgp.gradient import GradientAlgorithm, StepLosses
 from sb3_cgp.losses import bootstrap_target, cgp_loss, critic_loss, qgp_loss, smooth_target_actions
 from sb3_cgp.offline import descend_to_plateau
 from sb3_cgp.policies import CGPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
-from sb3_cgp.replay import LeanReplayAlgorithm
 from sb3_cgp.validation import (
     LINEAR_SCHEDULE_PREFIX,
     check_action_space,
@@ -48,7 +49,7 @@ def _as_schedule(rate: float | Schedule | str) -> Schedule:
     return FloatSchedule(rate)
 
 
-class CGP(LeanReplayAlgorithm):
+class CGP(GradientAlgorithm):
     """
     Cross-Entropy Guided Policies (CGP).
 
@@ -85,6 +86,9 @@ class CGP(LeanReplayAlgorithm):
     :param cem_dtype: what the critic's hidden layers compute in while CEM asks it: "float32", "bfloat16", or "auto", which
         is bfloat16 on processors that multiply it natively. Values, actions and the critic's own training are
         float32 in any case.
+    :param cuda_graphs: on a GPU, whether gradient steps and CEM's acting are recorded as CUDA graphs, which computes the same
+        much faster. What a selector of your own decides in Python is decided once, then. Has no effect on a CPU, nor
+        with ``Dict`` observations or another optimiser than the fused Adam.
     :param policy_loss: what the actor learns from: "cgp" imitates CEM, "qgp" climbs the critic's gradient,
         None trains no actor, so that CEM acts at inference too
     :param policy_training: "online" trains the actor along with the critics, "offline" when ``learn`` has finished
@@ -145,6 +149,7 @@ class CGP(LeanReplayAlgorithm):
         cem_elites: int = 6,
         cem_result: str = "best",
         cem_dtype: str = "auto",
+        cuda_graphs: bool = True,
         policy_loss: str | None = "cgp",
         policy_training: str = "online",
         inference: str | None = None,
@@ -192,6 +197,7 @@ class CGP(LeanReplayAlgorithm):
         self.cem_elites = cem_elites
         self.cem_result = cem_result
         self.cem_dtype = cem_dtype
+        self.cuda_graphs = cuda_graphs
         self.policy_loss = policy_loss
         self.policy_training = policy_training
         self.inference: str | None = inference
@@ -211,7 +217,7 @@ class CGP(LeanReplayAlgorithm):
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         # The first place that sees every environment's action space, before SB3's assertions, which name no value
-        env = LeanReplayAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        env = GradientAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         check_action_space(env.action_space)
         return env
 
@@ -236,6 +242,7 @@ class CGP(LeanReplayAlgorithm):
             self.policy.selector = CEM(self.cem_iterations, self.cem_samples, self.cem_elites, self.cem_result)
         self.policy.cem_dtype = self.cem_dtype
         self._choose_inference()
+        self._prepare_capture()
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -260,7 +267,7 @@ class CGP(LeanReplayAlgorithm):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         # SB3's rollout asks `predict`, which answers the user (and the callbacks) by the actor: here, CEM answers
-        with self.policy.inferring_by("cem"):
+        with self.policy.inferring_by("cem", self._captured_selection if self._is_captured else None):
             return super()._sample_action(learning_starts, action_noise, n_envs)
 
     def _store_transition(
@@ -297,47 +304,64 @@ class CGP(LeanReplayAlgorithm):
         self._update_learning_rate(self.critic.optimizer)
         self._update_actor_learning_rate(self._current_progress_remaining)
 
-        critic_losses, actor_losses, q_values = [], [], []
+        self._last_losses = []
         for _ in range(gradient_steps):
             self._n_updates += 1
             # Sample a minibatch
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            # For n-step replay, discount factor is gamma**n_steps (when no early termination)
-            discounts = batch.discounts if batch.discounts is not None else self.gamma
-
-            with th.no_grad():
-                # Sample next actions by CEM on the first target critic, and smooth them as TD3 does
-                next_actions = self.policy.select_actions(batch.next_observations, self.critic_target).actions
-                next_actions = smooth_target_actions(next_actions, self.target_policy_noise, self.target_noise_clip)
-                # Compute q*, with the min over all target critics
-                next_q_values = self.critic_target(batch.next_observations, next_actions)
-                target_q_values = bootstrap_target(batch.rewards, batch.dones, discounts, next_q_values)
-
-            # Update the critics
-            current_q_values = self.critic(batch.observations, batch.actions)
-            loss = critic_loss(current_q_values, target_q_values)
-            critic_losses.append(self._descend(self.critic.optimizer, loss, "critic"))
-            q_values.append(current_q_values[0].mean().item())
-
-            # Update the policy: as in TD3, its loss sees the critic just updated
-            if self._trains_policy_online and self._n_updates % self.policy_delay == 0:
-                actor_losses.append(self._train_actor(batch.observations))
-
-            # Update the target critics and the averaged actor
-            if self._n_updates % self.target_update_interval == 0:
-                self._update_average(self.critic, self.critic_target)
-                self._update_average(self.actor, self.actor_target)
-
+            trains_actor = self._trains_policy_online and self._n_updates % self.policy_delay == 0
+            updates_averages = self._n_updates % self.target_update_interval == 0
+            self._last_losses.append(self._step_on(batch, trains_actor, updates_averages))
             if self._n_updates % DIAGNOSTICS_INTERVAL == 0:
                 self._log_diagnostics(batch.observations, has_actor=self._trains_policy_online)
 
-        self._log_training(gradient_steps, critic_losses, actor_losses, q_values)
+        self._log_training(gradient_steps)
+
+    def _gradient_step(self, batch: ReplayBufferSamples, *turns: bool) -> StepLosses:
+        """
+        Do one gradient step (Algorithm 2).
+
+        :param batch: a minibatch
+        :param turns: whether the actor is trained, and whether the averages move
+        :return: the losses
+        :raises ValueError: if a loss is NaN or infinite, unless the step is captured
+        """
+        trains_actor, updates_averages = turns
+        self._loss_watch.begin_step()
+        # For n-step replay, discount factor is gamma**n_steps (when no early termination)
+        discounts = batch.discounts if batch.discounts is not None else self.gamma
+
+        with th.no_grad():
+            # Sample next actions by CEM on the first target critic, and smooth them as TD3 does
+            next_actions = self.policy.select_actions(batch.next_observations, self.critic_target).actions
+            next_actions = smooth_target_actions(next_actions, self.target_policy_noise, self.target_noise_clip)
+            # Compute q*, with the min over all target critics
+            next_q_values = self.critic_target(batch.next_observations, next_actions)
+            target_q_values = bootstrap_target(batch.rewards, batch.dones, discounts, next_q_values)
+
+        # Update the critics
+        current_q_values = self.critic(batch.observations, batch.actions)
+        loss = self._descend(self.critic.optimizer, critic_loss(current_q_values, target_q_values), "critic")
+
+        # Update the policy: as in TD3, its loss sees the critic just updated
+        actor_loss = self._train_actor(batch.observations) if trains_actor else None
+
+        # Update the target critics and the averaged actor
+        if updates_averages:
+            self._update_average(self.critic, self.critic_target)
+            self._update_average(self.actor, self.actor_target)
+
+        return StepLosses(loss, current_q_values[0].detach().mean(), actor_loss)
+
+    def _fixed_in_graphs(self) -> tuple[Hashable, ...]:
+        noise = (self.target_policy_noise, self.target_noise_clip)
+        return (self.gamma, self.tau, *noise, self.policy_loss, self.policy.cem_dtype, id(self.policy.selector))
 
     @property
     def _trains_policy_online(self) -> bool:
         return self.policy_loss is not None and self.policy_training == "online"
 
-    def _train_actor(self, observations: th.Tensor) -> float:
+    def _train_actor(self, observations: th.Tensor) -> th.Tensor:
         """
         Do one gradient step of the actor on the CGP loss or the QGP loss (Algorithm 2).
 
@@ -351,27 +375,6 @@ class CGP(LeanReplayAlgorithm):
             loss = qgp_loss(self.critic.q1_forward(observations, actions))
         return self._descend(self.actor.optimizer, loss, "actor")
 
-    def _descend(self, optimizer: th.optim.Optimizer, loss: th.Tensor, name: str) -> float:
-        """
-        Take one step down a loss, unless it is NaN or infinite.
-
-        :param optimizer: the network's optimiser
-        :param loss: the loss, a scalar
-        :param name: the network's name, for the error
-        :return: the loss, as a number
-        :raises ValueError: if the loss is NaN or infinite
-        """
-        value = loss.item()
-        if not np.isfinite(value):
-            raise ValueError(
-                f"The {name} loss is {value} at gradient step {self._n_updates}, environment step {self.num_timesteps}. "
-                f"The {name} is as before that step."
-            )
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        return value
-
     def _update_average(self, network: th.nn.Module, average: th.nn.Module) -> None:
         """Move a Polyak average towards its network; batch norm's running statistics are copied (SB3 issue #996)."""
         polyak_update(network.parameters(), average.parameters(), self.tau)
@@ -381,21 +384,19 @@ class CGP(LeanReplayAlgorithm):
     def _update_actor_learning_rate(self, progress_remaining: float) -> None:
         rate = self.actor_lr_schedule(progress_remaining)
         self.logger.record("train/actor_learning_rate", rate)
-        update_learning_rate(self.actor.optimizer, rate)
+        set_learning_rate(self.actor.optimizer, rate)
 
-    def _log_training(
-        self, gradient_steps: int, critic_losses: list[float], actor_losses: list[float], q_values: list[float]
-    ) -> None:
+    def _log_training(self, gradient_steps: int) -> None:
         steps = self.num_timesteps - self._timesteps_trained_at
         self._timesteps_trained_at = self.num_timesteps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/updates_per_step", gradient_steps / max(steps, 1))
-        self.logger.record("train/critic_loss", np.mean(critic_losses))
-        self.logger.record("train/q_value", np.mean(q_values))
-        if len(actor_losses) > 0:
-            self.logger.record("train/actor_loss", np.mean(actor_losses))
+        # To read them, the host would wait for the GPU: there, they are read when the log is written
+        if not self._is_captured:
+            self._log_losses()
 
     def _log_diagnostics(self, observations: th.Tensor, has_actor: bool) -> None:
+        self._loss_watch.check()
         self.policy.set_training_mode(False)
         for key, value in policy_diagnostics(self.policy, observations, has_actor).items():
             self.logger.record_mean(key, value)
@@ -432,6 +433,7 @@ class CGP(LeanReplayAlgorithm):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
+        self._loss_watch.check()
         # Without a gradient step of the critics, there is nothing new for the policy to learn
         if self.policy_training == "offline" and self._n_updates > n_updates:
             self.train_policy(callback=callback, progress_bar=progress_bar)
@@ -477,7 +479,9 @@ class CGP(LeanReplayAlgorithm):
             # Callbacks may have evaluated the policy
             self.policy.set_training_mode(True)
             self._update_actor_learning_rate(1.0 - (n_steps - 1) / max_steps)
-            loss = self._train_actor(sample().observations)
+            loss = self._train_actor(sample().observations).item()
+            if not np.isfinite(loss):
+                self._loss_watch.check()
             if n_steps % self.target_update_interval == 0:
                 self._update_average(self.actor, self.actor_target)
             return loss

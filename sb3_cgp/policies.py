@@ -1,6 +1,6 @@
 """The policies of CGP: TD3's networks, an action selector, and the choice of which of them acts."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -85,6 +85,7 @@ class CGPPolicy(TD3Policy):
         self.selector = CEM() if selector is None else selector
         self.inference = inference
         self.cem_dtype = cem_dtype
+        self._select: Callable[..., Any] | None = None
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -110,22 +111,25 @@ class CGPPolicy(TD3Policy):
             return self.selector.select(score, len(features), get_action_dim(self.action_space), features.device)
 
     @contextmanager
-    def inferring_by(self, inference: str) -> Iterator[None]:
+    def inferring_by(self, inference: str, select: Callable[..., Any] | None = None) -> Iterator[None]:
         """
         Let ``predict`` ask another network, or the selector, for a while.
 
         :param inference: "actor", "averaged_actor" or "cem"
+        :param select: does what :meth:`select_actions` does with the critic, in its place
         """
-        usual, self.inference = self.inference, inference
+        usual = self.inference, self._select
+        self.inference, self._select = inference, select
         try:
             yield
         finally:
-            self.inference = usual
+            self.inference, self._select = usual
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         # As in TD3, `deterministic` changes nothing: the actor has no noise, and CEM always samples
         if self.inference == "cem":
-            return self.select_actions(observation, self.critic).actions
+            actions, _ = self.select_actions(observation, self.critic) if self._select is None else self._select(observation)
+            return actions
         actor = self.actor_target if self.inference == "averaged_actor" else self.actor
         return actor(observation)
 

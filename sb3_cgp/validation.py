@@ -187,6 +187,7 @@ def check_cgp(model: Any) -> None:
     check_action_space(model.action_space)
     check_cem(model.cem_iterations, model.cem_samples, model.cem_elites, model.cem_result, prefix="cem_")
     require_choice("cem_dtype", model.cem_dtype, SCORING_DTYPES)
+    require(isinstance(model.cuda_graphs, bool), "cuda_graphs", model.cuda_graphs, "True or False")
     for name in ("batch_size", "buffer_size", "n_steps", "policy_delay", "target_update_interval"):
         require_count(name, getattr(model, name))
     require_count("learning_starts", model.learning_starts, minimum=0)

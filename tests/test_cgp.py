@@ -398,6 +398,7 @@ EMPTY = spaces.Box(np.ones(1, np.float32), np.ones(1, np.float32))
         (dict(cem_elites=True), "`cem_elites` is True, but must be an integer >= 1"),
         (dict(cem_result="median"), "`cem_result` is 'median', but must be one of 'best', 'mean'"),
         (dict(cem_dtype="float16"), "`cem_dtype` is 'float16', but must be one of 'auto', 'float32', 'bfloat16'"),
+        (dict(cuda_graphs="yes"), "`cuda_graphs` is 'yes', but must be True or False"),
         (dict(policy_kwargs=dict(cem_dtype="float32")), "'cem_dtype'.*outside them"),
         (dict(batch_size=0), "`batch_size` is 0, but must be an integer >= 1"),
         (dict(buffer_size=0), "`buffer_size` is 0, but must be an integer >= 1"),
