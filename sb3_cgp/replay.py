@@ -1,7 +1,8 @@
-"""Off-policy algorithms that take no more memory for their replay buffer than they need."""
+"""Off-policy algorithms that take no more memory for their replay buffer than they need, and the GPU's if it has it."""
 
 import io
 import pathlib
+import warnings
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,6 +12,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from sb3_cgp.buffers import DeviceReplayBuffer, fits_device
 
 SelfLeanReplayAlgorithm = TypeVar("SelfLeanReplayAlgorithm", bound="LeanReplayAlgorithm")
 
@@ -53,25 +56,44 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
 
     def _ensure_replay_buffer(self) -> ReplayBuffer:
         """
-        Allocate the replay buffer if there is none, as SB3 does it.
+        Allocate the replay buffer if there is none: as SB3 does it, or on the GPU.
+
+        The class is chosen here and not remembered, as a model may be loaded on another device than it was saved from.
 
         :return: the replay buffer
         """
-        if self.replay_buffer is None:
-            assert self.replay_buffer_class is not None
-            kwargs = self.replay_buffer_kwargs.copy()
-            if issubclass(self.replay_buffer_class, HerReplayBuffer):
-                kwargs["env"] = self.env
-            self.replay_buffer = self.replay_buffer_class(
-                self.buffer_size,
-                float32_space(self.observation_space),
-                self.action_space,
-                device=self.device,
-                n_envs=self.n_envs,
-                optimize_memory_usage=self.optimize_memory_usage,
-                **kwargs,
-            )
+        if self.replay_buffer is not None:
+            return self.replay_buffer
+        assert self.replay_buffer_class is not None
+        if fits_device(self.replay_buffer_class, self.observation_space, self.optimize_memory_usage, self.device):
+            try:
+                self.replay_buffer = self._allocate(DeviceReplayBuffer)
+                return self.replay_buffer
+            except th.cuda.OutOfMemoryError:
+                message = f"A replay buffer of {self.buffer_size} does not fit on {self.device}: it is kept on the host."
+                warnings.warn(message, stacklevel=2)
+        self.replay_buffer = self._allocate(self.replay_buffer_class)
         return self.replay_buffer
+
+    def _allocate(self, buffer_class: type[ReplayBuffer]) -> ReplayBuffer:
+        """
+        Make an empty replay buffer.
+
+        :param buffer_class: its class
+        :return: the replay buffer
+        """
+        kwargs = self.replay_buffer_kwargs.copy()
+        if issubclass(buffer_class, HerReplayBuffer):
+            kwargs["env"] = self.env
+        return buffer_class(
+            self.buffer_size,
+            float32_space(self.observation_space),
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            optimize_memory_usage=self.optimize_memory_usage,
+            **kwargs,
+        )
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
         self._ensure_replay_buffer()

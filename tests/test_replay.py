@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_cgp import CGP
 from sb3_cgp.replay import float32_space
 
-SMALL = dict(learning_starts=30, buffer_size=200, batch_size=8, cem_samples=8, cem_elites=2, seed=0)
+SMALL = dict(learning_starts=30, buffer_size=200, batch_size=8, cem_samples=8, cem_elites=2, seed=0, device="cpu")
 
 
 class Doubles(gym.Env):
