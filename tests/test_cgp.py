@@ -132,7 +132,7 @@ def test_eval_callback_scores_the_actor_within_learn(tmp_path):
     returns, _ = evaluate_policy(model.actor, eval_env, n_eval_episodes=2, return_episode_rewards=True)
     assert callback.evaluations_results[0] == pytest.approx(returns)
     # While the rollout acted by the selector
-    assert np.all(model.replay_buffer.actions[50:120] == 1.0)
+    assert (model.replay_buffer.actions[50:120] == 1.0).all()
 
 
 @pytest.mark.parametrize("inference", ["actor", "averaged_actor", "cem"])
@@ -313,7 +313,7 @@ def test_a_loaded_model_allocates_its_buffer_when_it_trains(tmp_path):
     assert loaded.replay_buffer.buffer_size == 700
     assert loaded.replay_buffer.size() == 100
     loaded.load_replay_buffer(tmp_path / "buffer")
-    assert np.array_equal(loaded.replay_buffer.actions, model.replay_buffer.actions)
+    assert (loaded.replay_buffer.actions == model.replay_buffer.actions).all()
 
 
 def test_a_loaded_model_goes_on_like_the_one_that_was_saved(tmp_path):
