@@ -46,6 +46,5 @@ def test_every_variant_swings_up_the_pendulum(variant, tmp_path):
 
 
 def test_cgp_reaches_on_mujoco(tmp_path):
-    # The paper's configuration, made smaller for speed. Random torques earn about -43, none at all -12
-    hyperparams = dict(n_timesteps=15_000, batch_size=64, policy_kwargs=dict(net_arch=[64, 64]))
-    assert mean_return("Reacher-v5", tmp_path, **hyperparams) >= -10
+    # Random torques earn about -43, none at all -12
+    assert mean_return("Reacher-v5", tmp_path, n_timesteps=20_000) >= -10
