@@ -5,9 +5,10 @@ A graph is what a function did on the GPU while it was recorded. Python does not
 on a value that the host would have to read, and whatever Python decides is fixed.
 """
 
+import functools
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from typing import Any
 
 import torch as th
@@ -28,10 +29,21 @@ class Recording:
     """
 
     def __init__(self, function: Callable[..., Tensors], inputs: Tensors):
+        gpu = _gpu_of(inputs)
+        assert gpu is not None
         self._inputs = _clones(inputs)
         self._graph = th.cuda.CUDAGraph()
-        with th.cuda.graph(self._graph):
-            self._outputs = function(*self._inputs)
+        usual = th.cuda.current_stream()
+        try:
+            with th.cuda.graph(self._graph, stream=_side_stream(gpu)):
+                self._outputs = function(*self._inputs)
+        except RuntimeError as error:
+            # PyTorch leaves the recording's stream in place
+            th.cuda.set_stream(usual)
+            reason = error.__context__ or error
+            raise RuntimeError(
+                f"CGP cannot be recorded as a CUDA graph: pass `cuda_graphs=False`. The reason: {reason}"
+            ) from error
 
     def fits(self, inputs: Tensors) -> bool:
         """
@@ -69,62 +81,74 @@ def _are_alike(tensor: th.Tensor | None, other: th.Tensor | None) -> bool:
 
 class Captured:
     """
-    A function of tensors on a GPU that is recorded after a few calls, and replayed from then on.
+    One function of tensors that is recorded on a GPU after a few calls, and replayed from then on.
 
-    It may change other tensors in place, such as parameters, which must stay where they are in memory. Where it cannot be
-    recorded, a warning says why, and every call is carried out as usual.
-
-    :param function: takes tensors (or None), and returns a tuple of them
+    It may change other tensors in place, such as parameters, which must stay where they are in memory. A function that makes
+    the host wait for the GPU cannot be recorded: a warning says so, and every call is carried out as usual.
     """
 
-    def __init__(self, function: Callable[..., Tensors]):
-        self._function = function
+    def __init__(self) -> None:
         self._recording: Recording | None = None
-        # Falls to zero before the recording
         self._eager_calls_left = EAGER_CALLS
-        self._is_refused = False
+        self._waits = False
 
-    def __call__(self, *inputs: th.Tensor | None) -> Tensors:
+    def __call__(self, function: Callable[..., Tensors], *inputs: th.Tensor | None) -> Tensors:
         """
         Carry the function out.
 
+        :param function: takes tensors (or None), and returns a tuple of them; the same in every call
         :param inputs: its arguments
         :return: what it returns
+        :raises RuntimeError: if the recording fails, from which the GPU's state does not recover
         """
+        gpu = _gpu_of(inputs)
         # Streams and graphs belong to the GPU that is current
-        with _gpu_of(inputs):
+        with nullcontext() if gpu is None else th.cuda.device(gpu):
             if self._eager_calls_left > 0:
                 self._eager_calls_left -= 1
-                return _call_on_a_side_stream(self._function, inputs)
-            if self._recording is None and not self._is_refused:
-                self._record(inputs)
+                outputs, self._waits = _rehearse(function, inputs, gpu)
+                return outputs
+            if self._recording is None and not self._waits:
+                self._recording = Recording(function, inputs)
             if self._recording is not None and self._recording.fits(inputs):
                 return self._recording.replay(inputs)
-            return self._function(*inputs)
-
-    def _record(self, inputs: Tensors) -> None:
-        try:
-            self._recording = Recording(self._function, inputs)
-        except RuntimeError as error:
-            self._is_refused = True
-            warnings.warn(f"No CUDA graph of this training can be recorded, so that it is slower: {error}", stacklevel=2)
+            return function(*inputs)
 
 
-def _gpu_of(inputs: Tensors) -> AbstractContextManager[Any]:
-    gpus = [tensor.device for tensor in inputs if tensor is not None and tensor.is_cuda]
-    return th.cuda.device(gpus[0]) if gpus else nullcontext()
+def _gpu_of(inputs: Tensors) -> th.device | None:
+    return next((tensor.device for tensor in inputs if tensor is not None and tensor.is_cuda), None)
 
 
-def _call_on_a_side_stream(function: Callable[..., Tensors], inputs: Tensors) -> Tensors:
-    """Call a function as PyTorch's manual has it done before a recording, which may not depend on the default stream."""
-    if not any(tensor is not None and tensor.is_cuda for tensor in inputs):
-        return function(*inputs)
-    usual, side = th.cuda.current_stream(), th.cuda.Stream()
+@functools.cache
+def _side_stream(gpu: th.device) -> th.cuda.Stream:
+    # One for all, as libraries keep working memory for each
+    return th.cuda.Stream(gpu)
+
+
+def _rehearse(function: Callable[..., Tensors], inputs: Tensors, gpu: th.device | None) -> tuple[Tensors, bool]:
+    """Call a function where it will be recorded, as PyTorch's manual asks for, and tell whether the host waits for the GPU."""
+    if gpu is None:
+        return function(*inputs), False
+    usual, side = th.cuda.current_stream(), _side_stream(gpu)
+    mode = th.cuda.get_sync_debug_mode()
     side.wait_stream(usual)
-    with th.cuda.stream(side):
-        outputs = function(*inputs)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        th.cuda.set_sync_debug_mode("warn")
+        try:
+            with th.cuda.stream(side):
+                outputs = function(*inputs)
+        finally:
+            th.cuda.set_sync_debug_mode(mode)
     usual.wait_stream(side)
-    return outputs
+    waits = [warning for warning in caught if "synchronizing CUDA operation" in str(warning.message)]
+    for warning in caught:
+        if warning not in waits and "prototype feature" not in str(warning.message):
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+    if len(waits) > 0:
+        place = f"{waits[0].filename}, line {waits[0].lineno}"
+        warnings.warn(f"The host waits for the GPU in {place}: this cannot be a CUDA graph, and is slower.", stacklevel=2)
+    return outputs, len(waits) > 0
 
 
 class LossWatch:
@@ -165,7 +189,10 @@ class LossWatch:
 
         :raises ValueError: if a loss was NaN or infinite
         """
-        for name, step in zip(self._names, self._first_bad.tolist(), strict=True):
+        first_bad = self._first_bad.tolist()
+        # In place, where graphs write to; mended data may be trained on
+        self._first_bad.fill_(-1)
+        for name, step in zip(self._names, first_bad, strict=True):
             if step >= 0:
                 raise ValueError(
                     f"The {name} loss was NaN or infinite at gradient step {step}. "
@@ -183,34 +210,37 @@ def can_capture(device: th.device) -> bool:
     return device.type == "cuda" and th.version.cuda is not None
 
 
-def set_capturable(optimizer: th.optim.Optimizer, is_captured: bool, device: th.device) -> None:
+def set_capturable(optimizer: th.optim.Optimizer, rate: th.Tensor | None) -> None:
     """
-    Let a fused Adam take its steps inside a CUDA graph, or outside.
+    Let an optimiser take its steps inside a CUDA graph, or outside.
 
-    :param optimizer: the optimiser
-    :param is_captured: whether its steps are recorded; its learning rate is a tensor then, which can change all the same
-    :param device: the device
+    :param optimizer: the optimiser; if it was made as a fused Adam, it becomes one again, whatever was loaded into it
+    :param rate: the tensor that is its learning rate inside a graph, and can change there; None outside
     """
     for group in optimizer.param_groups:
         if "capturable" in group:
-            group["capturable"] = is_captured
-        rate = float(group["lr"])
-        group["lr"] = th.tensor(rate, device=device) if is_captured else rate
+            group["capturable"] = rate is not None
+        group["lr"] = float(group["lr"]) if rate is None else rate
+        if is_fused_adam(optimizer):
+            group.update(fused=True, foreach=None)
+            for state in (optimizer.state[parameter] for parameter in group["params"] if parameter in optimizer.state):
+                state["step"] = th.as_tensor(state["step"], dtype=th.float32, device=group["params"][0].device)
     skip_step_if(optimizer, None)
 
 
-def set_learning_rate(optimizer: th.optim.Optimizer, rate: float) -> None:
+def set_learning_rate(optimizer: th.optim.Optimizer, rate: float, captured_rate: th.Tensor | None) -> None:
     """
-    Set an optimiser's learning rate, in place where it is a tensor.
+    Set an optimiser's learning rate.
 
     :param optimizer: the optimiser
     :param rate: the learning rate
+    :param captured_rate: the tensor that graphs read it from; None outside of graphs
     """
+    if captured_rate is not None:
+        captured_rate.fill_(rate)
     for group in optimizer.param_groups:
-        if isinstance(group["lr"], th.Tensor):
-            group["lr"].fill_(rate)
-        else:
-            group["lr"] = rate
+        # Somebody else may have put a number in the tensor's place
+        group["lr"] = rate if captured_rate is None else captured_rate
 
 
 def skip_step_if(optimizer: Any, is_bad: th.Tensor | None) -> None:
@@ -224,11 +254,11 @@ def skip_step_if(optimizer: Any, is_bad: th.Tensor | None) -> None:
     optimizer.found_inf = is_bad
 
 
-def is_capturable(optimizer: th.optim.Optimizer) -> bool:
+def is_fused_adam(optimizer: th.optim.Optimizer) -> bool:
     """
     Tell whether an optimiser can take its steps inside a CUDA graph, and skip one there.
 
     :param optimizer: the optimiser
-    :return: whether it is a fused Adam
+    :return: whether it was made as a fused Adam
     """
     return isinstance(optimizer, th.optim.Adam) and bool(optimizer.defaults["fused"])

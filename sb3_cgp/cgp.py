@@ -1,6 +1,5 @@
 """Cross-Entropy Guided Policies: the arguments, acting, and training in the order of the paper's Algorithm 2."""
 
-from collections.abc import Hashable
 from functools import partial
 from typing import Any, ClassVar, TypeVar
 
@@ -267,7 +266,7 @@ class CGP(GradientAlgorithm):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         # SB3's rollout asks `predict`, which answers the user (and the callbacks) by the actor: here, CEM answers
-        with self.policy.inferring_by("cem", self._captured_selection if self._is_captured else None):
+        with self.policy.inferring_by("cem", self._select_actions if self._is_captured else None):
             return super()._sample_action(learning_starts, action_noise, n_envs)
 
     def _store_transition(
@@ -304,18 +303,19 @@ class CGP(GradientAlgorithm):
         self._update_learning_rate(self.critic.optimizer)
         self._update_actor_learning_rate(self._current_progress_remaining)
 
-        self._last_losses = []
+        losses = []
         for _ in range(gradient_steps):
             self._n_updates += 1
             # Sample a minibatch
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             trains_actor = self._trains_policy_online and self._n_updates % self.policy_delay == 0
             updates_averages = self._n_updates % self.target_update_interval == 0
-            self._last_losses.append(self._step_on(batch, trains_actor, updates_averages))
+            losses.append(self._step_on(batch, trains_actor, updates_averages))
             if self._n_updates % DIAGNOSTICS_INTERVAL == 0:
                 self._log_diagnostics(batch.observations, has_actor=self._trains_policy_online)
 
         self._log_training(gradient_steps)
+        self._record_losses(losses)
 
     def _gradient_step(self, batch: ReplayBufferSamples, *turns: bool) -> StepLosses:
         """
@@ -353,9 +353,10 @@ class CGP(GradientAlgorithm):
 
         return StepLosses(loss, current_q_values[0].detach().mean(), actor_loss)
 
-    def _fixed_in_graphs(self) -> tuple[Hashable, ...]:
+    def _fixed_in_graphs(self) -> tuple[Any, ...]:
         noise = (self.target_policy_noise, self.target_noise_clip)
-        return (self.gamma, self.tau, *noise, self.policy_loss, self.policy.cem_dtype, id(self.policy.selector))
+        selector = self.policy.selector
+        return (self.gamma, self.tau, *noise, self.policy_loss, self.policy.cem_dtype, selector, repr(selector))
 
     @property
     def _trains_policy_online(self) -> bool:
@@ -384,16 +385,13 @@ class CGP(GradientAlgorithm):
     def _update_actor_learning_rate(self, progress_remaining: float) -> None:
         rate = self.actor_lr_schedule(progress_remaining)
         self.logger.record("train/actor_learning_rate", rate)
-        set_learning_rate(self.actor.optimizer, rate)
+        set_learning_rate(self.actor.optimizer, rate, self._captured_rates.get(self.actor.optimizer))
 
     def _log_training(self, gradient_steps: int) -> None:
         steps = self.num_timesteps - self._timesteps_trained_at
         self._timesteps_trained_at = self.num_timesteps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/updates_per_step", gradient_steps / max(steps, 1))
-        # To read them, the host would wait for the GPU: there, they are read when the log is written
-        if not self._is_captured:
-            self._log_losses()
 
     def _log_diagnostics(self, observations: th.Tensor, has_actor: bool) -> None:
         self._loss_watch.check()

@@ -1,6 +1,6 @@
 """Off-policy algorithms whose gradient steps are watched for NaN, and are CUDA graphs on a GPU."""
 
-from collections.abc import Hashable
+from collections import defaultdict
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.td3.policies import Actor
 
-from sb3_cgp.captured import Captured, LossWatch, can_capture, is_capturable, set_capturable, set_learning_rate, skip_step_if
+from sb3_cgp.captured import Captured, LossWatch, can_capture, is_fused_adam, set_capturable, set_learning_rate, skip_step_if
 from sb3_cgp.policies import CGPPolicy
 from sb3_cgp.replay import LeanReplayAlgorithm
 
@@ -52,7 +52,7 @@ class GradientAlgorithm(LeanReplayAlgorithm):
         """
         raise NotImplementedError
 
-    def _fixed_in_graphs(self) -> tuple[Hashable, ...]:
+    def _fixed_in_graphs(self) -> tuple[Any, ...]:
         """List the settings that a graph fixes when it is recorded, and that a callback may change."""
         raise NotImplementedError
 
@@ -63,14 +63,30 @@ class GradientAlgorithm(LeanReplayAlgorithm):
             self.cuda_graphs
             and can_capture(self.device)
             and isinstance(self.observation_space, spaces.Box)
-            and all(map(is_capturable, optimizers))
+            and all(map(is_fused_adam, optimizers))
         )
+        self._captured_rates: dict[th.optim.Optimizer, th.Tensor] = {}
         for optimizer in optimizers:
-            set_capturable(optimizer, self._is_captured, self.device)
-        self._captured_steps: dict[tuple[Hashable, ...], Captured] = {}
-        self._captured_selection = Captured(lambda observation: self.policy.select_actions(observation, self.critic))
+            if self._is_captured:
+                self._captured_rates[optimizer] = th.tensor(float(optimizer.param_groups[0]["lr"]), device=self.device)
+            set_capturable(optimizer, self._captured_rates.get(optimizer))
+        # By what is due in a gradient step; None for acting
+        self._captures: defaultdict[tuple[bool, ...] | None, Captured] = defaultdict(Captured)
+        self._captured_settings: tuple[Any, ...] = ()
         self._loss_watch = LossWatch(("critic", "actor"), self._n_updates, self.device)
-        self._last_losses: list[StepLosses] = []
+        self._unlogged_losses: dict[str, list[th.Tensor]] = {}
+
+    def _capture(self, turns: tuple[bool, ...] | None) -> Captured:
+        """Find the capture of a gradient step or of acting, a new one if a setting has changed."""
+        settings = self._fixed_in_graphs()
+        if settings != self._captured_settings:
+            self._captures.clear()
+            self._captured_settings = settings
+        return self._captures[turns]
+
+    def _select_actions(self, observation: th.Tensor) -> tuple[th.Tensor | None, ...]:
+        """Select actions for acting while training, as a CUDA graph."""
+        return self._capture(None)(lambda observation: self.policy.select_actions(observation, self.critic), observation)
 
     def set_parameters(
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
@@ -98,10 +114,11 @@ class GradientAlgorithm(LeanReplayAlgorithm):
         """
         if not self._is_captured:
             return self._gradient_step(batch, *turns)
-        fixed = (*turns, *self._fixed_in_graphs())
-        if fixed not in self._captured_steps:
-            self._captured_steps[fixed] = Captured(lambda *fields: self._gradient_step(ReplayBufferSamples(*fields), *turns))
-        return StepLosses(*self._captured_steps[fixed](*batch))  # type: ignore[arg-type]
+
+        def step(*fields: th.Tensor) -> StepLosses:
+            return self._gradient_step(ReplayBufferSamples(*fields), *turns)
+
+        return StepLosses(*self._capture(turns)(step, *batch))  # type: ignore[arg-type]
 
     def _descend(self, optimizer: th.optim.Optimizer, loss: th.Tensor, name: str) -> th.Tensor:
         """
@@ -130,14 +147,23 @@ class GradientAlgorithm(LeanReplayAlgorithm):
         rate = self.lr_schedule(self._current_progress_remaining)
         self.logger.record("train/learning_rate", rate)
         for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
-            set_learning_rate(optimizer, rate)
+            set_learning_rate(optimizer, rate, self._captured_rates.get(optimizer))
 
-    def _log_losses(self) -> None:
-        columns = zip(*self._last_losses, strict=True)
-        for key, values in zip(("train/critic_loss", "train/q_value", "train/actor_loss"), columns, strict=False):
+    def _record_losses(self, losses: list[StepLosses]) -> None:
+        """Log the means over some gradient steps; on a GPU when the log is written, as the host would have to wait for it."""
+        for key, values in zip(
+            ("train/critic_loss", "train/q_value", "train/actor_loss"), zip(*losses, strict=True), strict=False
+        ):
             present = [value for value in values if value is not None]
             if len(present) > 0:
-                self.logger.record(key, th.stack(present).mean().item())
+                self._unlogged_losses[key] = present
+        if not self._is_captured:
+            self._log_losses()
+
+    def _log_losses(self) -> None:
+        for key, values in self._unlogged_losses.items():
+            self.logger.record(key, th.stack(values).mean().item())
+        self._unlogged_losses.clear()
 
     def dump_logs(self) -> None:
         """
@@ -151,5 +177,5 @@ class GradientAlgorithm(LeanReplayAlgorithm):
         super().dump_logs()
 
     def _excluded_save_params(self) -> list[str]:
-        captured = ["_is_captured", "_captured_steps", "_captured_selection", "_loss_watch", "_last_losses"]
+        captured = ["_is_captured", "_captured_rates", "_captures", "_captured_settings", "_loss_watch", "_unlogged_losses"]
         return [*super()._excluded_save_params(), *captured]

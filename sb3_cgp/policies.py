@@ -66,8 +66,9 @@ class CGPPolicy(TD3Policy):
     ):
         require_choice("inference", inference, INFERENCES)
         require_choice("cem_dtype", cem_dtype, SCORING_DTYPES)
-        if optimizer_class is th.optim.Adam:
-            optimizer_kwargs = {"fused": True} | (optimizer_kwargs or {})
+        optimizer_kwargs = optimizer_kwargs or {}
+        if optimizer_class is th.optim.Adam and not optimizer_kwargs.keys() & {"fused", "foreach", "differentiable"}:
+            optimizer_kwargs = optimizer_kwargs | {"fused": True}
         super().__init__(
             observation_space,
             action_space,

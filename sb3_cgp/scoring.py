@@ -4,6 +4,7 @@ How a critic scores many actions per state.
 Shapes: B states, N actions per state, A action dimensions, F features, H units of a layer.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, TypeGuard
 
@@ -16,21 +17,27 @@ from sb3_cgp.cem import Score
 # Hidden activations of one block, per thread: about what stays in a core's cache (1 MiB of float32)
 BLOCK_SIZE = 2**18
 
-Layer = Callable[[th.Tensor], th.Tensor]
+# Maps hidden activations, (B N, H), given N, to the next ones, and may overwrite them
+Layer = Callable[[th.Tensor, int], th.Tensor]
 
 
-def _find_onednn_linear() -> Callable[..., th.Tensor] | None:
+@functools.cache
+def _onednn_linear(dtype: th.dtype) -> Callable[..., th.Tensor] | None:
     """
     Find oneDNN's linear layer with a rectifier fused to it, which PyTorch's compiler uses and keeps private.
 
     The public one asks MKL for float32, which is at half oneDNN's speed on AMD's processors, and does not fuse.
+
+    :param dtype: the data type
+    :return: the function; None where there is none, or none for this processor
     """
-    if not th.backends.mkldnn.is_available():
-        return None
-    return getattr(th.ops.mkldnn, "_linear_pointwise", None)
-
-
-_onednn_linear = _find_onednn_linear()
+    linear = getattr(th.ops.mkldnn, "_linear_pointwise", None) if th.backends.mkldnn.is_available() else None
+    if linear is not None:
+        try:
+            linear(th.ones(1, 1, dtype=dtype), th.ones(1, 1, dtype=dtype), None, "relu", [], "")
+        except RuntimeError:
+            return None
+    return linear
 
 
 def scoring_dtype(setting: str, device: th.device) -> th.dtype:
@@ -61,12 +68,11 @@ def q_score(q_network: nn.Module, features: th.Tensor, dtype: th.dtype = th.floa
 
     :param q_network: maps features and actions side by side, (rows, F + A), to values, (rows, 1)
     :param features: the states' features, (B, F)
-    :param dtype: data type of the hidden layers' products, which bfloat16 may make faster. Where the network has layers
-        with parameters that are not linear, it is float32 all the same. The first and the last layer, and so
-        the values, are always float32.
+    :param dtype: data type of the hidden layers' products, which bfloat16 may make faster. Everything else is float32,
+        and so is all of a network that has layers with parameters that are not linear.
     :return: the scoring function, (B, N, A) -> (B, N), without gradients
     """
-    if type(q_network) is nn.Sequential and len(q_network) > 0 and _is_linear(q_network[0]):
+    if _begins_with_linear(q_network):
         return _score_by_parts(q_network, features, dtype)
     return repeated_q_score(q_network, features)
 
@@ -109,7 +115,7 @@ def _score_by_parts(q_network: nn.Sequential, features: th.Tensor, dtype: th.dty
             weights = action_weight.expand(len(block_actions), -1, -1)
             hidden = th.baddbmm(state_part[block], block_actions, weights).flatten(0, 1)
             for layer in layers:
-                hidden = layer(hidden)
+                hidden = layer(hidden, n_actions)
             values[block] = hidden.view(-1, n_actions)
         return values
 
@@ -117,7 +123,7 @@ def _score_by_parts(q_network: nn.Sequential, features: th.Tensor, dtype: th.dty
 
 
 def _prepare(modules: list[nn.Module], dtype: th.dtype) -> list[Layer]:
-    """Turn the modules after the first into functions that may overwrite their input, which is ours alone."""
+    """Turn the modules after the first into layers."""
     hidden_dtype = dtype if all(_is_linear(module) or _is_bare(module) for module in modules) else th.float32
     last = max((index for index, module in enumerate(modules) if _is_linear(module)), default=None)
     layers: list[Layer] = []
@@ -129,8 +135,15 @@ def _prepare(modules: list[nn.Module], dtype: th.dtype) -> list[Layer]:
         elif is_fused:
             is_fused = False
         else:
-            layers.append(th.relu_ if type(module) is nn.ReLU else module)
+            layers.append(_activation(module))
     return layers
+
+
+def _begins_with_linear(q_network: nn.Module) -> TypeGuard[nn.Sequential]:
+    if type(q_network) is not nn.Sequential or len(q_network) == 0 or not _is_linear(q_network[0]):
+        return False
+    # A hook may do anything
+    return not any(map(_is_hooked, q_network.modules()))
 
 
 def _is_linear(module: nn.Module) -> TypeGuard[nn.Linear]:
@@ -138,23 +151,56 @@ def _is_linear(module: nn.Module) -> TypeGuard[nn.Linear]:
     return type(module) is nn.Linear
 
 
+def _is_hooked(module: nn.Module) -> bool:
+    # PyTorch has no public way to ask
+    return bool(module._forward_hooks or module._forward_pre_hooks)
+
+
 def _is_bare(module: nn.Module) -> bool:
     """Whether a module has neither parameters nor buffers, as activations have none: it works in any data type."""
     return next(module.parameters(), None) is None and next(module.buffers(), None) is None
 
 
+def _activation(module: nn.Module) -> Layer:
+    if type(module) is nn.ReLU:
+        return lambda hidden, n_actions: hidden.relu_()
+    return lambda hidden, n_actions: module(hidden)
+
+
 def _hidden_linear(linear: nn.Linear, dtype: th.dtype, is_rectified: bool) -> Layer:
-    """Make the function of a hidden linear layer and its rectifier, the parameters converted once instead of per block."""
+    """Make a hidden linear layer and its rectifier."""
+    if dtype != th.float32:
+        return _rounded_linear(linear, dtype, is_rectified)
+    return lambda hidden, n_actions: _multiply(hidden, linear.weight, linear.bias, is_rectified)
+
+
+def _rounded_linear(linear: nn.Linear, dtype: th.dtype, is_rectified: bool) -> Layer:
+    """
+    Make a hidden linear layer that multiplies in another data type, and its rectifier.
+
+    ``W x + b = (W r + b) + W (x - r)``, where r is a state's mean input: only the differences between its actions are rounded,
+    which CEM ranks, and not what its actions have in common, which may be much larger.
+    """
     weight = linear.weight.to(dtype)
-    bias = None if linear.bias is None else linear.bias.to(dtype)
-    if weight.device.type == "cpu" and _onednn_linear is not None:
-        activation = "relu" if is_rectified else "none"
-        return lambda hidden: _onednn_linear(hidden.to(dtype), weight, bias, activation, [], "")
-    if is_rectified:
-        return lambda hidden: F.linear(hidden.to(dtype), weight, bias).relu_()
-    return lambda hidden: F.linear(hidden.to(dtype), weight, bias)
+
+    def layer(hidden: th.Tensor, n_actions: int) -> th.Tensor:
+        inputs = hidden.unflatten(0, (-1, n_actions))
+        common = inputs.mean(dim=1, keepdim=True)
+        differences = inputs.sub_(common).flatten(0, 1).to(dtype)
+        outputs = _multiply(differences, weight).to(hidden.dtype)
+        outputs.unflatten(0, (-1, n_actions)).add_(_multiply(common.squeeze(1), linear.weight, linear.bias).unsqueeze(1))
+        return outputs.relu_() if is_rectified else outputs
+
+    return layer
+
+
+def _multiply(hidden: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None, is_rectified: bool = False) -> th.Tensor:
+    onednn_linear = _onednn_linear(hidden.dtype) if hidden.device.type == "cpu" else None
+    if onednn_linear is not None:
+        return onednn_linear(hidden, weight, bias, "relu" if is_rectified else "none", [], "")
+    product = F.linear(hidden, weight, bias)
+    return product.relu_() if is_rectified else product
 
 
 def _last_linear(linear: nn.Linear) -> Layer:
-    # In float32 whatever the hidden layers are in: values in bfloat16 are too coarse to tell good actions apart
-    return lambda hidden: F.linear(hidden.to(linear.weight.dtype), linear.weight, linear.bias)
+    return lambda hidden, n_actions: F.linear(hidden, linear.weight, linear.bias)

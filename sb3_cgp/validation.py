@@ -15,7 +15,7 @@ POLICY_TRAININGS = ("online", "offline")
 INFERENCES = ("actor", "averaged_actor", "cem")
 SCORING_DTYPES = ("auto", "float32", "bfloat16")
 LINEAR_SCHEDULE_PREFIX = "lin_"
-LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
+LARGEST_FLOAT32 = np.finfo(np.float32).max
 
 
 def require(condition: bool, name: str, value: Any, allowed: str) -> None:

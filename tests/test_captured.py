@@ -11,7 +11,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.noise import NormalActionNoise
 
-from sb3_cgp import CGP, captured, gradient
+from sb3_cgp import CEM, CGP, captured, gradient
 from sb3_cgp.captured import EAGER_CALLS, Captured, LossWatch
 
 needs_gpu = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
@@ -83,19 +83,50 @@ def test_captured_training_is_eager_training(stand_in, name):
 
 
 def test_every_combination_of_turns_is_recorded_once_and_acting_too(stand_in):
-    model = make_model(policy_delay=2, target_update_interval=3).learn(30 + 6 * (EAGER_CALLS + 5))
+    make_model(policy_delay=2, target_update_interval=3).learn(30 + 6 * (EAGER_CALLS + 5))
     # Two by two turns, and the selection of actions
-    assert len(model._captured_steps) == 4
     assert StandIn.made == 4 + 1
 
 
-def test_a_changed_setting_is_recorded_anew(stand_in):
-    models = [make_model(cuda_graphs=cuda_graphs).learn(60) for cuda_graphs in (True, False)]
-    for model in models:
-        model.set_random_seed(3)
-        model.gamma, model.tau, model.target_policy_noise = 0.5, 0.1, 0.0
-        model.learn(60, reset_num_timesteps=False)
-    assert th.equal(*map(parameters, models))
+def change_gamma(model):
+    model.gamma = 0.5
+
+
+def change_selector(model):
+    model.policy.selector = CEM(2, 8, 3)
+
+
+def change_selector_in_place(model):
+    model.policy.selector.elites = 3
+
+
+@pytest.mark.parametrize("change", [change_gamma, change_selector, change_selector_in_place])
+def test_a_changed_setting_is_recorded_anew(stand_in, change):
+    model = make_model(target_update_interval=1).learn(60)
+    assert StandIn.made == 2
+    model.learn(10, reset_num_timesteps=False)
+    assert StandIn.made == 2
+    change(model)
+    model.learn(10, reset_num_timesteps=False)
+    assert StandIn.made == 4
+    eager = make_model(target_update_interval=1, cuda_graphs=False).learn(60)
+    eager.learn(10, reset_num_timesteps=False)
+    change(eager)
+    eager.learn(10, reset_num_timesteps=False)
+    assert th.equal(parameters(model), parameters(eager))
+
+
+def test_a_graphs_learning_rate_stays_where_it_is(stand_in):
+    model = make_model(learning_rate=lambda progress: 2**-8 if progress > 0.5 else 2**-9).learn(60)
+    optimizers = (model.actor.optimizer, model.critic.optimizer)
+    rates = [optimizer.param_groups[0]["lr"] for optimizer in optimizers]
+    # As a callback might, to no effect: the schedule rules, as it does in SB3
+    optimizers[0].param_groups[0]["lr"] = 1.0
+    model._current_progress_remaining = 1.0
+    model.train(2, 16)
+    for optimizer, rate in zip(optimizers, rates, strict=True):
+        assert optimizer.param_groups[0]["lr"] is rate
+        assert rate.item() == 2**-8
 
 
 def test_parameters_that_are_set_are_trained_on(stand_in):
@@ -105,7 +136,10 @@ def test_parameters_that_are_set_are_trained_on(stand_in):
         # An optimiser keeps the very tensors that it is given
         model.set_parameters(copy.deepcopy(other.get_parameters()))
         model.set_random_seed(3)
+        made = StandIn.made
         model.learn(60, reset_num_timesteps=False)
+        # What was recorded knows where the optimisers' state was, not where it is
+        assert (StandIn.made > made) == model._is_captured
     assert th.equal(*map(parameters, models))
 
 
@@ -123,13 +157,18 @@ def test_a_captured_model_goes_on_where_nothing_is_captured(stand_in, tmp_path, 
 
 
 def test_losses_are_logged_when_the_log_is_written(stand_in):
-    model = make_model().learn(100)
+    model = make_model(policy_delay=2).learn(99)
     assert "train/critic_loss" not in model.logger.name_to_value
-    recorded = {}
-    model.logger.dump = lambda step: recorded.update(model.logger.name_to_value)
+    model.logger.dump = lambda step: None
+    critic_loss, actor_loss = (model._unlogged_losses[f"train/{name}_loss"] for name in ("critic", "actor"))
+    # The actor's is from the step before
     model.dump_logs()
-    assert recorded["train/critic_loss"] == pytest.approx(model._last_losses[-1].critic.item())
-    assert recorded["train/actor_loss"] == pytest.approx(model._last_losses[-1].actor.item())
+    recorded = model.logger.name_to_value
+    assert recorded["train/critic_loss"] == pytest.approx(critic_loss[0].item())
+    assert recorded["train/actor_loss"] == pytest.approx(actor_loss[0].item())
+    recorded.clear()
+    model.dump_logs()
+    assert "train/critic_loss" not in recorded
 
 
 def test_a_nan_loss_is_skipped_by_the_device_and_raised_when_it_is_read(stand_in):
@@ -142,6 +181,11 @@ def test_a_nan_loss_is_skipped_by_the_device_and_raised_when_it_is_read(stand_in
     assert all(map(th.equal, before, model.critic.parameters()))
     with pytest.raises(ValueError, match=f"The critic loss was NaN or infinite at gradient step {updates + 1}"):
         model.dump_logs()
+    # Mended, it trains on
+    model.replay_buffer.rewards[:] = 0.0
+    model.train(4, 16)
+    model.dump_logs()
+    assert not any(map(th.equal, before, model.critic.parameters()))
 
 
 def test_a_nan_loss_ends_the_training_at_the_next_look_at_it(stand_in):
@@ -151,16 +195,21 @@ def test_a_nan_loss_ends_the_training_at_the_next_look_at_it(stand_in):
         model.learn(5, reset_num_timesteps=False)
 
 
-def test_what_cannot_be_recorded_is_carried_out_with_one_warning(stand_in, monkeypatch):
-    def refuse(function, inputs):
-        raise RuntimeError("operation not permitted")
+def test_what_makes_the_host_wait_is_carried_out_as_it_is(stand_in, monkeypatch):
+    monkeypatch.setattr(captured, "_rehearse", lambda function, inputs, gpu: (function(*inputs), True))
+    model = make_model().learn(80)
+    assert StandIn.made == 0
+    assert th.equal(parameters(model), parameters(make_model(cuda_graphs=False).learn(80)))
 
-    monkeypatch.setattr(captured, "Recording", refuse)
-    with pytest.warns(UserWarning, match="No CUDA graph .* operation not permitted") as warned:
-        model = make_model(target_update_interval=1).learn(80)
-    # Gradient steps, and the selection of actions
-    assert len([warning for warning in warned if "CUDA graph" in str(warning.message)]) == 2
-    assert th.equal(parameters(model), parameters(make_model(target_update_interval=1, cuda_graphs=False).learn(80)))
+
+def test_models_of_before_the_fused_adam_are_captured(stand_in):
+    old = CGP("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[16], optimizer_kwargs=dict(fused=False)), **SMALL)
+    old.learn(60)
+    model = make_model(seed=5)
+    model.set_parameters(copy.deepcopy(old.get_parameters()))
+    assert model._is_captured
+    assert model.critic.optimizer.param_groups[0]["fused"] is True
+    model.learn(60)
 
 
 @pytest.mark.parametrize(
@@ -179,25 +228,23 @@ def test_other_optimisers_are_not_captured(stand_in, kwargs):
 def test_a_function_is_called_then_recorded_once_then_replayed(monkeypatch):
     monkeypatch.setattr(captured, "Recording", StandIn)
     monkeypatch.setattr(StandIn, "made", 0)
-    calls = []
 
     def double(tensor, nothing):
-        calls.append(tensor)
         return 2 * tensor, None
 
-    function = Captured(double)
+    call = Captured()
     for value in range(EAGER_CALLS + 3):
-        doubled, nothing = function(th.full((2,), float(value)), None)
+        doubled, nothing = call(double, th.full((2,), float(value)), None)
         assert doubled.tolist() == [2.0 * value] * 2
         assert nothing is None
         assert StandIn.made == (value >= EAGER_CALLS)
     # Another shape or type than the recorded one
-    assert function(th.ones(3), None)[0].tolist() == [2.0] * 3
-    assert function(th.ones(2, dtype=th.long), None)[0].dtype == th.long
+    assert call(double, th.ones(3), None)[0].tolist() == [2.0] * 3
+    assert call(double, th.ones(2, dtype=th.long), None)[0].dtype == th.long
     assert StandIn.made == 1
     # What was returned before is not overwritten
-    first = function(th.ones(2), None)[0]
-    function(th.zeros(2), None)
+    first = call(double, th.ones(2), None)[0]
+    call(double, th.zeros(2), None)
     assert first.tolist() == [2.0, 2.0]
 
 
@@ -215,15 +262,31 @@ def test_the_watch_remembers_the_first_bad_step_of_each_loss():
 
 @needs_gpu
 @pytest.mark.parametrize("name", VARIANTS)
-def test_graphs_train_as_eager_steps_do(name):
+def test_graphs_train_as_eager_steps_do(monkeypatch, name):
+    monkeypatch.setattr("sb3_cgp.offline.ROUND", 10)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         models = [
             make_model(**VARIANTS[name], device="cuda", cuda_graphs=cuda_graphs).learn(60) for cuda_graphs in (True, False)
         ]
     assert [model._is_captured for model in models] == [True, False]
-    assert any(step._recording is not None for step in models[0]._captured_steps.values())
+    assert all(capture._recording is not None for capture in models[0]._captures.values())
     th.testing.assert_close(*map(parameters, models), rtol=1e-3, atol=1e-4)
+
+
+@needs_gpu
+def test_a_selector_that_waits_for_the_gpu_is_not_recorded_and_works():
+    class Waiting(CEM):
+        def select(self, score, n_states, action_dim, device="cpu"):
+            selection = super().select(score, n_states, action_dim, device)
+            assert selection.actions.abs().max().item() <= 1.0
+            return selection
+
+    model = CGP("MlpPolicy", "Pendulum-v1", device="cuda", policy_kwargs=dict(selector=Waiting(2, 8, 2)), **SMALL)
+    with pytest.warns(UserWarning, match="The host waits for the GPU in"):
+        model.learn(60)
+    assert model._n_updates == 30
+    assert all(capture._recording is None for capture in model._captures.values())
 
 
 @needs_gpu

@@ -1,6 +1,5 @@
 """The fast way of scoring many actions against the plain one, and both against a matrix product at a time."""
 
-import numpy as np
 import oracles
 import pytest
 import torch as th
@@ -73,37 +72,62 @@ def test_scoring_changes_neither_its_inputs_nor_the_network():
         assert th.equal(old, new)
 
 
-def hidden_bfloat16(network, features, actions):
-    """The network row by row, what enters and what parameterises a hidden layer rounded to bfloat16."""
-    layers = [layer for layer in network if isinstance(layer, nn.Linear)]
+def rounded_differences(network, features, actions):
+    """
+    The network a state at a time in float64, save for the hidden layers' products. They are of what an action's activations
+    differ by from the state's mean ones: weights, differences and products are rounded to bfloat16.
+    """
+
+    def rounded(tensor):
+        return tensor.bfloat16().double()
+
+    first, *hidden_layers, last = [layer for layer in network if isinstance(layer, nn.Linear)]
     scores = th.empty(actions.shape[:2])
-    for state, index in np.ndindex(*actions.shape[:2]):
-        hidden = oracles.perceptron([layers[0].weight], [layers[0].bias], th.cat([features[state], actions[state, index]]))
-        for layer in layers[1:-1]:
-            rounded = [tensor.bfloat16() for tensor in (layer.weight, layer.bias, hidden.clamp(min=0.0))]
-            hidden = oracles.perceptron(rounded[:1], rounded[1:2], rounded[2]).bfloat16().double()
-        hidden = oracles.perceptron([layers[-1].weight], [layers[-1].bias], hidden.clamp(min=0.0))
-        scores[state, index] = hidden.item()
+    for state, of_state in enumerate(actions):
+        inputs = [th.cat([features[state], action]) for action in of_state]
+        rows = th.stack([oracles.perceptron([first.weight], [first.bias], row) for row in inputs]).clamp(min=0.0)
+        for layer in hidden_layers:
+            mean = rows.mean(dim=0)
+            common = oracles.perceptron([layer.weight], [layer.bias], mean)
+            rows = th.stack([common + rounded(rounded(layer.weight) @ rounded(row - mean)) for row in rows]).clamp(min=0.0)
+        scores[state] = th.stack([oracles.perceptron([last.weight], [last.bias], row) for row in rows])[:, 0]
     return scores
 
 
 @pytest.mark.parametrize("with_onednn", [True, False])
 @th.no_grad()
-def test_bfloat16_rounds_the_hidden_layers_and_nothing_else(monkeypatch, with_onednn):
+def test_bfloat16_rounds_differences_between_actions_and_nothing_else(monkeypatch, with_onednn):
     if not with_onednn:
-        monkeypatch.setattr(scoring, "_onednn_linear", None)
+        monkeypatch.setattr(scoring, "_onednn_linear", lambda dtype: None)
     network = mlp([32, 64, 16])
     features = th.randn(4, N_FEATURES)
     actions = th.rand(4, 6, ACTION_DIM) * 2 - 1
-    # A value so large that bfloat16 could not tell the actions apart
-    network[-1].bias += 1_000.0
     scores = q_score(network, features, th.bfloat16)(actions)
     exact = repeated_q_score(network, features)(actions)
     assert scores.dtype == th.float32
-    assert len(scores.unique()) == scores.numel()
-    th.testing.assert_close(scores, hidden_bfloat16(network, features, actions), rtol=0.0, atol=2e-3)
-    # It does round, by less than two bfloat16 numbers near 1000 lie apart
-    assert 0.0 < (scores - exact).abs().max() < 0.1
+    th.testing.assert_close(scores, rounded_differences(network, features, actions), rtol=0.0, atol=5e-6)
+    # It does round
+    assert (scores - exact).abs().max() > 4e-5
+
+
+@th.no_grad()
+def test_bfloat16_ranks_actions_that_differ_little_from_one_another():
+    network = mlp([64, 64])
+    # Large activations, which bfloat16 itself would round by far more than the actions change them
+    network[0].bias += 50.0
+    features = th.randn(32, N_FEATURES)
+    actions = th.rand(32, 1, ACTION_DIM) + 0.01 * th.randn(32, 64, ACTION_DIM)
+    exact, scores = (q_score(network, features, dtype)(actions) for dtype in (th.float32, th.bfloat16))
+    elites, others = (values.topk(6, dim=1).indices for values in (exact, scores))
+    assert (elites.unsqueeze(2) == others.unsqueeze(1)).any(dim=2).float().mean() > 0.9
+
+
+@th.no_grad()
+def test_networks_with_hooks_are_called_as_they_are():
+    network = mlp([16, 16])
+    network[2].register_forward_hook(lambda layer, inputs, output: 2 * output)
+    features, actions = th.randn(4, N_FEATURES), th.rand(4, 6, ACTION_DIM)
+    th.testing.assert_close(q_score(network, features)(actions), repeated_q_score(network, features)(actions))
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -146,4 +170,4 @@ def test_auto_is_float32_on_a_gpu(monkeypatch):
 
 def test_the_private_function_exists_in_the_tested_pytorch():
     # Without it everything works, but no faster than MKL: the constraints' PyTorch should have it
-    assert scoring._onednn_linear is not None or not th.backends.mkldnn.is_available()
+    assert scoring._onednn_linear(th.float32) is not None or not th.backends.mkldnn.is_available()
