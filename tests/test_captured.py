@@ -4,7 +4,10 @@ that it was recorded with: everything but PyTorch's CUDA graphs is tested on any
 """
 
 import copy
+import re
 import warnings
+from contextlib import contextmanager, nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -258,6 +261,113 @@ def test_the_watch_remembers_the_first_bad_step_of_each_loss():
     with pytest.raises(ValueError, match="critic loss was NaN or infinite at gradient step 13"):
         watch.check()
     LossWatch(("critic",), 0, th.device("cpu")).check()
+
+
+class Stream:
+    """A stream that remembers what it was told."""
+
+    def __init__(self, name):
+        self.name, self.waited_for = name, []
+
+    def wait_stream(self, other):
+        self.waited_for.append(other.name)
+
+
+@pytest.fixture
+def make_believe_gpu(monkeypatch):
+    """PyTorch's streams and graphs, as far as they are used, without a GPU behind them: carried out at once."""
+    streams = {"current": Stream("usual")}
+    side = Stream("side")
+
+    @contextmanager
+    def stream(entered):
+        left, streams["current"] = streams["current"], entered
+        yield
+        streams["current"] = left
+
+    @contextmanager
+    def graph(graph, stream):
+        streams["current"] = stream
+        # As PyTorch does, not in a `finally`
+        yield
+        streams["current"] = usual
+
+    usual = streams["current"]
+    monkeypatch.setattr(captured, "_gpu_of", lambda inputs: th.device("cuda", 0))
+    monkeypatch.setattr(captured, "_side_stream", lambda gpu: side)
+    for name, replacement in {
+        "device": lambda gpu: nullcontext(),
+        "current_stream": lambda: streams["current"],
+        "set_stream": lambda stream: streams.update(current=stream),
+        "stream": stream,
+        "graph": graph,
+        "CUDAGraph": lambda: SimpleNamespace(replay=lambda: None),
+        "get_sync_debug_mode": lambda: 0,
+        "set_sync_debug_mode": lambda mode: None,
+    }.items():
+        monkeypatch.setattr(th.cuda, name, replacement)
+    return SimpleNamespace(streams=streams, usual=usual, side=side)
+
+
+def test_rehearsals_run_on_the_side_stream_in_order(make_believe_gpu):
+    seen = []
+
+    def function(tensor):
+        seen.append(make_believe_gpu.streams["current"].name)
+        return (2 * tensor,)
+
+    outputs, waits = captured._rehearse(function, (th.ones(1),), th.device("cuda", 0))
+    assert (outputs[0].item(), waits, seen) == (2.0, False, ["side"])
+    assert make_believe_gpu.side.waited_for == ["usual"]
+    assert make_believe_gpu.usual.waited_for == ["side"]
+
+
+def test_a_host_that_waits_is_noticed_and_other_warnings_are_passed_on(make_believe_gpu):
+    def function(tensor):
+        warnings.warn("Synchronization debug mode is a prototype feature and may miss some", stacklevel=1)
+        warnings.warn("called a synchronizing CUDA operation", stacklevel=1)
+        warnings.warn("something else", stacklevel=1)
+        return (tensor,)
+
+    call = Captured()
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        call(function, th.ones(1))
+    other, waiting = (str(warning.message) for warning in warned)
+    assert other == "something else"
+    assert re.match("The host waits for the GPU in .*test_captured.py, line ", waiting)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for _ in range(EAGER_CALLS):
+            call(function, th.ones(1))
+    assert call._recording is None
+
+
+def test_a_recording_is_made_on_the_side_stream(make_believe_gpu):
+    seen = []
+
+    def function(tensor, nothing):
+        seen.append(make_believe_gpu.streams["current"].name)
+        return (2 * tensor,)
+
+    recording = captured.Recording(function, (th.ones(1), None))
+    assert seen == ["side"]
+    assert make_believe_gpu.streams["current"] is make_believe_gpu.usual
+    assert recording.fits((th.zeros(1), None))
+    assert not recording.fits((th.zeros(1), th.zeros(1)))
+    assert not recording.fits((th.zeros(1),))
+    # This graph does nothing when replayed: what it returns is as it was recorded
+    assert recording.replay((th.zeros(1), None))[0].item() == 2.0
+    assert recording._inputs[0].item() == 0.0
+
+
+def test_a_recording_that_fails_says_what_to_do_and_restores_the_stream(make_believe_gpu):
+    def function(tensor):
+        raise RuntimeError("operation not permitted when stream is capturing")
+
+    with pytest.raises(RuntimeError, match=r"pass `cuda_graphs=False`\. The reason: operation not permitted"):
+        captured.Recording(function, (th.ones(1),))
+    assert make_believe_gpu.streams["current"] is make_believe_gpu.usual
 
 
 @needs_gpu

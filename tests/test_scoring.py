@@ -1,5 +1,7 @@
 """The fast way of scoring many actions against the plain one, and both against a matrix product at a time."""
 
+from types import SimpleNamespace
+
 import oracles
 import pytest
 import torch as th
@@ -166,6 +168,26 @@ def test_auto_is_bfloat16_where_the_processor_has_it(monkeypatch, setting, capab
 def test_auto_is_float32_on_a_gpu(monkeypatch):
     monkeypatch.setattr(th.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
     assert scoring.scoring_dtype("auto", th.device("cuda")) == th.float32
+
+
+@pytest.mark.parametrize("reason", ["no oneDNN", "no such function", "not on this processor"])
+def test_without_onednn_scores_are_the_same(monkeypatch, reason):
+    def refuse(*args):
+        raise RuntimeError("could not create a primitive descriptor")
+
+    if reason == "no oneDNN":
+        monkeypatch.setattr(th.backends.mkldnn, "is_available", lambda: False)
+    else:
+        functions = SimpleNamespace() if reason == "no such function" else SimpleNamespace(_linear_pointwise=refuse)
+        monkeypatch.setattr(th.ops, "mkldnn", functions)
+    scoring._onednn_linear.cache_clear()
+    try:
+        assert scoring._onednn_linear(th.float32) is None
+        features, actions = th.randn(4, N_FEATURES), th.rand(4, 6, ACTION_DIM)
+        for network in (NETWORKS["two hidden layers"], NETWORKS["three layers, tanh"]):
+            th.testing.assert_close(q_score(network, features)(actions), repeated_q_score(network, features)(actions))
+    finally:
+        scoring._onednn_linear.cache_clear()
 
 
 def test_the_private_function_exists_in_the_tested_pytorch():
