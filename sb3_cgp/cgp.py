@@ -85,9 +85,10 @@ class CGP(GradientAlgorithm):
     :param cem_dtype: what the critic's hidden layers compute in while CEM asks it: "float32", "bfloat16", or "auto", which
         is bfloat16 on processors that multiply it natively. Values, actions and the critic's own training are
         float32 in any case.
-    :param cuda_graphs: on a GPU, whether gradient steps and CEM's acting are recorded as CUDA graphs, which computes the same
-        much faster. What a selector of your own decides in Python is decided once, then. Has no effect on a CPU, nor
-        with ``Dict`` observations or another optimiser than the fused Adam.
+    :param cuda_graphs: on a GPU, whether gradient steps and CEM's acting are recorded as CUDA graphs, and the replay buffer
+        lies on the GPU, which is to compute the same in less time. What a selector of your own decides in Python is
+        decided once, then. Has no effect on a CPU, nor with ``Dict`` observations or another optimiser than the
+        fused Adam. Off by default, as it has not been run on a GPU yet.
     :param policy_loss: what the actor learns from: "cgp" imitates CEM, "qgp" climbs the critic's gradient,
         None trains no actor, so that CEM acts at inference too
     :param policy_training: "online" trains the actor along with the critics, "offline" when ``learn`` has finished
@@ -148,7 +149,7 @@ class CGP(GradientAlgorithm):
         cem_elites: int = 6,
         cem_result: str = "best",
         cem_dtype: str = "auto",
-        cuda_graphs: bool = True,
+        cuda_graphs: bool = False,
         policy_loss: str | None = "cgp",
         policy_training: str = "online",
         inference: str | None = None,

@@ -40,7 +40,6 @@ class GradientAlgorithm(LeanReplayAlgorithm):
     policy: CGPPolicy
     actor: Actor
     critic: ContinuousCritic
-    cuda_graphs: bool
 
     def _gradient_step(self, batch: ReplayBufferSamples, *turns: bool) -> StepLosses:
         """

@@ -43,6 +43,8 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
     ``record_video`` see to that themselves, but only for a fixed list of algorithms.
     """
 
+    # An argument of the algorithm's: the buffer lies on the GPU to be of use to them
+    cuda_graphs: bool = False
     # Set by `load`, before the model is built
     _replay_buffer_deferred: bool = False
 
@@ -65,7 +67,8 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         if self.replay_buffer is not None:
             return self.replay_buffer
         assert self.replay_buffer_class is not None
-        if fits_device(self.replay_buffer_class, self.observation_space, self.optimize_memory_usage, self.device):
+        arguments = (self.replay_buffer_class, self.observation_space, self.optimize_memory_usage, self.device)
+        if self.cuda_graphs and fits_device(*arguments):
             try:
                 self.replay_buffer = self._allocate(DeviceReplayBuffer)
                 return self.replay_buffer

@@ -183,7 +183,13 @@ def make_env(n_envs=1, normalises=False, env_class=Doubles):
 
 def make_model(env, policy="MlpPolicy", **kwargs):
     small = dict(learning_starts=30, buffer_size=60, batch_size=8, cem_samples=8, cem_elites=2, seed=0, device="cpu")
-    return CGP(policy, env, policy_kwargs=dict(net_arch=[8]), **(small | kwargs))
+    return CGP(policy, env, policy_kwargs=dict(net_arch=[8]), **(small | dict(cuda_graphs=True) | kwargs))
+
+
+def test_the_buffer_stays_sb3s_unless_asked_for(monkeypatch):
+    monkeypatch.setattr("sb3_cgp.buffers.is_accelerator", lambda device: True)
+    assert type(make_model(make_env(), cuda_graphs=False).replay_buffer) is ReplayBuffer
+    assert type(make_model(make_env()).replay_buffer) is DeviceReplayBuffer
 
 
 def parameters(model):

@@ -19,7 +19,16 @@ from sb3_cgp.captured import EAGER_CALLS, Captured, LossWatch
 
 needs_gpu = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 # Learning rates are powers of two: a captured one is a float32
-SMALL = dict(learning_rate=2**-10, learning_starts=30, buffer_size=1_000, batch_size=16, cem_samples=8, cem_elites=2, seed=0)
+SMALL = dict(
+    cuda_graphs=True,
+    learning_rate=2**-10,
+    learning_starts=30,
+    buffer_size=1_000,
+    batch_size=16,
+    cem_samples=8,
+    cem_elites=2,
+    seed=0,
+)
 VARIANTS = {
     "CGP-Online": dict(),
     "CGP-Offline": dict(policy_training="offline"),
