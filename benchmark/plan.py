@@ -14,6 +14,8 @@ from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import ALGOS, get_latest_run_id
 from rl_zoo3.exp_manager import ExperimentManager
 
+from benchmark.arguments import count
+
 EVALUATIONS_PER_RUN = 20
 LONGEST_INTERVAL = 10_000
 
@@ -83,7 +85,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--algo", default="cgp", choices=list(ALGOS), help="algorithm (default: %(default)s)")
     parser.add_argument("--env", default="Pendulum-v1", help="environment (default: %(default)s)")
     parser.add_argument("--folder", default="logs", help="rl_zoo3's log folder (default: %(default)s)")
-    parser.add_argument("--steps", type=int, help="length of the run (default: what the YAML file says)")
+    parser.add_argument("--steps", type=count, help="length of the run (default: what the YAML file says)")
     args = parser.parse_args(argv)
     print(planned_interval(args.algo, args.env, args.steps), next_run_id(args.folder, args.algo, args.env))
 

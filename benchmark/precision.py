@@ -245,9 +245,11 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     """
     parser = measuring_parser("precision", "Compare training with CEM in bfloat16 and in float32.", with_seed=False)
     parser.add_argument(
-        "--envs", nargs="*", type=continuous_environment, default=["HalfCheetah-v5", "Pendulum-v1"], help="environments"
+        "--envs", nargs="*", type=continuous_environment, default=["Pendulum-v1"], help="environments (default: Pendulum-v1)"
     )
-    parser.add_argument("--steps", type=count, help="environment steps (default: what the YAML file says)")
+    parser.add_argument(
+        "--steps", type=count, help="environment steps (default: what the YAML file says, 1e6 for the paper's tasks)"
+    )
     parser.add_argument(
         "--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4], help="seeds of the training (default: 0 to 4)"
     )

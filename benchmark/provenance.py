@@ -3,12 +3,15 @@
 import os
 import platform
 import shlex
+import subprocess
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import torch as th
+
+from sb3_cgp.scoring import scoring_dtype
 
 PACKAGES = (
     "sb3-cgp",
@@ -59,17 +62,35 @@ def machine(device: th.device) -> dict[str, Any]:
     Describe the hardware in use.
 
     :param device: where the networks live
-    :return: operating system, processor and its instruction set, cores, PyTorch's threads, device, and the GPU's name
+    :return: operating system, processor, its instruction set and CEM's data type on it, cores, PyTorch's threads, device, and
+        the GPU's name
     """
     return {
         "system": platform.platform(),
         "cpu": cpu_model(),
         "cpu_capability": th.backends.cpu.get_cpu_capability(),
+        # What `cem_dtype="auto"` stands for here
+        "cem_dtype": str(scoring_dtype("auto", device)).removeprefix("torch."),
         "cores": os.cpu_count(),
         "torch_threads": th.get_num_threads(),
         "device": str(device),
         "gpu": th.cuda.get_device_name(device) if device.type == "cuda" else None,
     }
+
+
+def commit() -> str | None:
+    """
+    Name the code that runs.
+
+    :return: the commit of the clone that this file lies in, with "+" where files differ from it; None outside of a clone
+    """
+    git = ["git", "-C", str(Path(__file__).parent)]
+    try:
+        name = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True).stdout
+        changes = subprocess.run([*git, "status", "--porcelain", "-uno"], capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return name.strip() + "+" * bool(changes.strip())
 
 
 def conditions(module: str, argv: Sequence[str], device: th.device) -> dict[str, Any]:
@@ -79,10 +100,12 @@ def conditions(module: str, argv: Sequence[str], device: th.device) -> dict[str,
     :param module: the command's module
     :param argv: its arguments
     :param device: where it computes
-    :return: the command line, the versions, the hardware, and how many other processes wanted the processor just before
+    :return: the command line, the commit, the versions, the hardware, and how many other processes wanted the processor
+        just before
     """
     return {
         "command": shlex.join(["python", "-m", module, *argv]),
+        "commit": commit(),
         "versions": package_versions(),
         "machine": machine(device),
         # Windows has no such figure
@@ -103,5 +126,6 @@ def conditions_in_words(record: dict[str, Any]) -> str:
     versions = ", ".join(f"{package} {version}" for package, version in record["versions"].items() if version is not None)
     return (
         f"`{record['command']}` on {hardware['cpu']} ({hardware['cpu_capability']}, {hardware['cores']} cores), "
-        f"{threads}, networks on {place}, load average before the start {record['load_average']}.\n\n{versions}."
+        f"{threads}, networks on {place}, CEM by default in {hardware['cem_dtype']}, commit {record['commit']}, "
+        f"load average before the start {record['load_average']}.\n\n{versions}."
     )

@@ -30,7 +30,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from benchmark.files import write_atomically, write_json
-from benchmark.provenance import machine, package_versions
+from benchmark.provenance import commit, machine, package_versions
 
 # Far from the seeds that people train with: rl_zoo3 gives the training's environments the run's own
 EVALUATION_SEED = 10_000
@@ -273,6 +273,7 @@ def build_record(run: Run, model: BaseAlgorithm, curve: Curve, returns: list[flo
         },
         "curve": asdict(curve),
         "seconds_to_last_training_episode": training_seconds(run.folder),
+        "commit": commit(),
         "versions": package_versions(),
         "machine": machine(model.device),
     }

@@ -54,7 +54,7 @@ def scoring_dtype(setting: str, device: th.device) -> th.dtype:
 
 
 def _has_native_bfloat16() -> bool:
-    # PyTorch of before 2.11 cannot be asked: float32 is never wrong
+    # Older versions of PyTorch cannot be asked: float32 is never wrong
     capabilities: dict[str, Any] = getattr(th.cpu, "get_capabilities", dict)()
     return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
 

@@ -33,3 +33,10 @@ def test_next_run_follows_the_latest(tmp_path: Path) -> None:
 def test_prints_one_line_for_the_makefile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plan.main(["--algo", "td3", "--folder", str(tmp_path)])
     assert capsys.readouterr().out == "1000 1\n"
+
+
+@pytest.mark.parametrize("steps", ["0", "-5", "many"])
+def test_refuses_a_length_that_is_none(steps: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        plan.main([f"--steps={steps}"])
+    assert f"argument --steps: '{steps}' is not an integer >= 1" in capsys.readouterr().err

@@ -1,0 +1,36 @@
+"""What a record says of the code and the machine."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch as th
+
+from benchmark import provenance
+
+
+def test_a_commit_is_named_and_changes_to_it_are_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "provenance.py"))
+    assert provenance.commit() is None
+    for command in ("init -q", "config user.name Nobody", "config user.email nobody@example.com"):
+        subprocess.run(["git", *command.split()], cwd=tmp_path, check=True)
+    (tmp_path / "code.py").write_text("1")
+    subprocess.run(["git", "add", "code.py"], cwd=tmp_path, check=True)
+    subprocess.run(["git", "commit", "-q", "-m", "First"], cwd=tmp_path, check=True)
+    name = provenance.commit()
+    assert name is not None
+    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    assert head.startswith(name)
+    (tmp_path / "code.py").write_text("2")
+    assert provenance.commit() == name + "+"
+
+
+def test_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    assert provenance.commit() is None
+
+
+@pytest.mark.parametrize("has_bfloat16", [True, False])
+def test_a_machine_says_what_cem_computes_in(monkeypatch: pytest.MonkeyPatch, has_bfloat16: bool) -> None:
+    monkeypatch.setattr(th.cpu, "get_capabilities", lambda: {"avx512_bf16": has_bfloat16}, raising=False)
+    assert provenance.machine(th.device("cpu"))["cem_dtype"] == ("bfloat16" if has_bfloat16 else "float32")
