@@ -187,7 +187,7 @@ def reward_row(runs: list[dict[str, Any]]) -> list[str]:
     """
     means = {dtype: [float(np.mean(run["returns"])) for run in runs if run["dtype"] == dtype] for dtype in DTYPES}
     seeds = (", ".join(str(run["seed"]) for run in runs if run["dtype"] == dtype) for dtype in DTYPES)
-    row = [runs[0]["env"], " / ".join(dict.fromkeys(seeds)), f"{runs[0]['steps']:,}"]
+    row = [runs[0]["env"], " / ".join(dict.fromkeys(filter(None, seeds))), f"{runs[0]['steps']:,}"]
     if any(len(values) < 2 for values in means.values()):
         return [*row, "-", "-", "-", "-"]
     row += [f"{np.mean(values):.1f} ± {np.std(values, ddof=1):.1f}" for values in means.values()]
