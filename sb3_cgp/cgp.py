@@ -1,6 +1,7 @@
 """Cross-Entropy Guided Policies: the arguments, acting, and training in the order of the paper's Algorithm 2."""
 
 from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -22,6 +23,8 @@ from stable_baselines3.td3.policies import Actor
 from sb3_cgp.captured import set_learning_rate
 from sb3_cgp.cem import CEM
 from sb3_cgp.diagnostics import policy_diagnostics
+from sb3_cgp.export import export_policy
+from sb3_cgp.exported import ExportedPolicy, load_weights
 from sb3_cgp.gradient import GradientAlgorithm, StepLosses
 from sb3_cgp.losses import bootstrap_target, cgp_loss, critic_loss, qgp_loss, smooth_target_actions
 from sb3_cgp.offline import descend_to_plateau
@@ -208,6 +211,8 @@ class CGP(GradientAlgorithm):
         self.target_noise_clip = target_noise_clip
         # Offline, the actor is of no use until `train_policy` has trained it
         self._policy_is_trained = False
+        # Whether the networks know only observations that VecNormalize has normalised
+        self._learnt_normalized = False
         # Environment steps at the last call of `train`, to log the gradient steps per environment step
         self._timesteps_trained_at = 0
 
@@ -260,6 +265,7 @@ class CGP(GradientAlgorithm):
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
         first_obs = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
         check_finite("observation", first_obs, self.num_timesteps)
+        self._learnt_normalized = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
         self._timesteps_trained_at = max(self.num_timesteps, self.learning_starts)
         return total_timesteps, callback
 
@@ -503,6 +509,37 @@ class CGP(GradientAlgorithm):
         if self.verbose >= 1:
             print(f"The policy was trained for {n_steps} gradient steps")
         return self
+
+    def export(self, folder: str | Path) -> None:
+        """
+        Write the policy that ``predict`` asks, to be used elsewhere and loaded without pickle.
+
+        ``policy.onnx`` takes a batch of observations as the environment gives them (images channels first) and returns
+        actions as the environment takes them; VecNormalize's statistics, as they are now, are part of it.
+        ``policy.safetensors`` and ``policy.json`` are what :meth:`load_weights` reads. Both are asked for a few random
+        observations, and compared with ``predict``, before anything is written.
+
+        :param folder: where to write; it is made if it is missing. An export that is there is replaced when all of the
+            new one is on the disk.
+        :raises ValueError: if the policy cannot be exported, naming what is in the way and what is allowed: an actor must
+            act, on a ``Box``, by SB3's own features extractors and one of PyTorch's usual activation functions
+        :raises ImportError: if a package of the ``export`` extra is not installed
+        """
+        export_policy(self, folder)
+
+    @classmethod
+    def load_weights(cls, folder: str | Path) -> ExportedPolicy:
+        """
+        Load a policy that :meth:`export` wrote, from safetensors and JSON alone. Unlike :meth:`load`, it cannot run code
+        that someone put into the files.
+
+        :param folder: where the policy was exported to
+        :return: a policy that predicts, and cannot be trained; it takes observations that are not normalised
+        :raises ValueError: if a file is damaged, of another export, or says what is not allowed; it names the file and why
+        :raises FileNotFoundError: if ``policy.json`` or ``policy.safetensors`` is missing
+        :raises ImportError: if safetensors is not installed
+        """
+        return load_weights(folder)
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "actor_target", "critic", "critic_target"]
