@@ -20,6 +20,7 @@ PACKAGES = (
     "sb3_contrib",
     "sbx-rl",
     "torch",
+    "onnxruntime",
     "jax",
     "gymnasium",
     "mujoco",

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from matplotlib.image import imread
 from stable_baselines3.common.env_util import make_vec_env
 
-from benchmark import arguments, contenders, products, runtime, scaling, selector
+from benchmark import arguments, contenders, latency, products, runtime, scaling, selector
 from benchmark.boxes import BoxEnv
 from benchmark.plain import PlainPolicy
 from benchmark.products import Sizes
@@ -21,7 +21,7 @@ from sb3_cgp import CGP
 from sb3_cgp.scoring import repeated_q_score
 
 CPU = th.device("cpu")
-COMMANDS = {"runtime": runtime, "selector": selector, "scaling": scaling}
+COMMANDS = {"latency": latency, "runtime": runtime, "selector": selector, "scaling": scaling}
 
 
 def test_turns_rotate_and_the_burn_in_is_not_timed():
@@ -337,6 +337,22 @@ def test_scaling_varies_the_model(algorithm):
             assert model.cem_samples == (9 if axis == "cem_samples" else 64)
 
 
+def test_latency_is_of_single_actions_that_agree(tmp_path):
+    record = run_command("latency", tmp_path, "--env", "Pendulum-v1", "--rounds", "3", "--actions", "2", "--device", "cpu")
+    assert list(record["ways"]) == ["`predict`", "`load_weights`", "onnxruntime"]
+    for figures in record["ways"].values():
+        assert len(figures["seconds"]["all"]) == 3
+        assert min(figures["seconds"]["all"]) > 0.0
+    assert record["ways"]["`predict`"]["ratio_to_predict"] == 1.0
+    text = (tmp_path / "latency.md").read_text()
+    assert "medians of 3\nrounds of 2 actions each" in text
+    model = CGP("MlpPolicy", "Pendulum-v1", buffer_size=1, seed=1)
+    observation = np.array([0.6, -0.8, 3.0], np.float32)
+    actions = [act(observation) for act in latency.ways_to_act(model, tmp_path / "export", threads=1).values()]
+    assert [action.shape for action in actions] == [(1,)] * 3
+    assert np.allclose(actions, actions[0], atol=1e-4)
+
+
 @pytest.mark.filterwarnings("ignore:.*A Box observation space:UserWarning")
 def test_box_env_keeps_to_its_spaces():
     check_env(BoxEnv(5, 3), skip_render_check=True)
@@ -353,6 +369,8 @@ def test_box_env_keeps_to_its_spaces():
         ("selector", "--dtypes int8", "argument --dtypes: invalid choice: 'int8'"),
         ("selector", "--threads -1", "argument --threads: '-1' is not an integer >= 1"),
         ("selector", "--device abacus", "argument --device: 'abacus' is not available"),
+        ("latency", "--env CartPole-v1", "argument --env: 'CartPole-v1' has no continuous actions"),
+        ("latency", "--actions 0", "argument --actions: '0' is not an integer >= 1"),
         ("scaling", "--axes seed", "argument --axes: invalid choice: 'seed'"),
         ("scaling", "--rounds many", "argument --rounds: 'many' is not an integer >= 1"),
     ],
