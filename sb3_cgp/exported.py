@@ -235,8 +235,10 @@ def _check_tensors(tensors: Mapping[str, th.Tensor], expected: Mapping[str, th.T
     missing, extra = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
     if missing or extra:
         raise ValueError(f"The tensors do not belong to this network: missing are {missing}, and too many {extra}.")
-    for name, tensor in tensors.items():
-        found, wanted = (f"{value.dtype} of shape {tuple(value.shape)}" for value in (tensor, expected[name]))
+    # In the network's order: safetensors returns its tensors in another one each time
+    for name, value in expected.items():
+        tensor = tensors[name]
+        found, wanted = (f"{each.dtype} of shape {tuple(each.shape)}" for each in (tensor, value))
         if found != wanted:
             raise ValueError(f"The tensor {name} is {found}, but must be {wanted}.")
         if not bool(th.isfinite(tensor).all()):
@@ -277,15 +279,16 @@ def build(description: Mapping[str, Any], tensors: Mapping[str, th.Tensor]) -> E
     action_space = _read_box(description["action_space"], "action_space", ACTION_DTYPES)
     check_action_space(action_space)
     actor = _make_actor(description["network"], observation_space, action_space)
-    expected, normalization = dict(actor.state_dict()), None
+    expected: dict[str, th.Tensor] = {}
+    normalization = None
     if description["normalization"] is not None:
         epsilon, clip_obs = _fields(description["normalization"], "normalization", ("epsilon", "clip_obs"))
         require_number("epsilon", epsilon)
         if clip_obs is not None:
             require_number("clip_obs", clip_obs)
         statistics = th.empty(observation_space.shape, dtype=th.float64, device="meta")
-        expected |= {MEAN: statistics, VARIANCE: statistics}
-    _check_tensors(tensors, expected)
+        expected = {MEAN: statistics, VARIANCE: statistics}
+    _check_tensors(tensors, expected | actor.state_dict())
     if description["normalization"] is not None:
         mean, variance = tensors[MEAN], tensors[VARIANCE]
         require(bool((variance >= 0.0).all() and (variance + epsilon > 0.0).all()), VARIANCE, variance, "positive")
