@@ -32,6 +32,20 @@ def write_json(path: Path, record: dict[str, Any]) -> None:
     write_atomically(path, (json.dumps(record, indent=2, default=str) + "\n").encode())
 
 
+def publish(folder: Path, name: str, record: dict[str, Any], text: str) -> None:
+    """
+    Write what a command measured, and show it.
+
+    :param folder: where to write
+    :param name: the files' name, without an extension
+    :param record: what was measured, for programs
+    :param text: the same in Markdown, for people
+    """
+    write_json(folder / f"{name}.json", record)
+    write_atomically(folder / f"{name}.md", text.encode())
+    print(text)
+
+
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """
     Lay out a table, its first column to the left and the others to the right.

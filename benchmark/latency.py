@@ -16,7 +16,7 @@ import onnxruntime
 import torch as th
 
 from benchmark.arguments import continuous_environment, count, measuring_parser
-from benchmark.files import markdown_table, write_atomically, write_json
+from benchmark.files import markdown_table, publish
 from benchmark.provenance import conditions, conditions_in_words
 from benchmark.timing import interleaved, ratio, summary
 from sb3_cgp import CGP
@@ -133,10 +133,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "actions": args.actions,
         "ways": measure(args),
     }
-    write_json(args.folder / "latency.json", record)
-    text = markdown(record)
-    write_atomically(args.folder / "latency.md", text.encode())
-    print(text)
+    publish(args.folder, "latency", record, markdown(record))
 
 
 if __name__ == "__main__":

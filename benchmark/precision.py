@@ -7,17 +7,13 @@ have their record are not repeated, so that it can be interrupted, and run in se
 
 import argparse
 import json
-import os
 import sys
-import tempfile
 from collections.abc import Sequence
-from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
-from rl_zoo3.exp_manager import ExperimentManager
 from scipy import stats
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -28,10 +24,10 @@ from benchmark.arguments import continuous_environment, count, measuring_parser
 from benchmark.files import markdown_table, write_atomically, write_json
 from benchmark.provenance import conditions
 from benchmark.report import EVALUATION_SEED
+from benchmark.training import train_by_zoo
 from sb3_cgp import CEM, CGP
 from sb3_cgp.cem import Score
 from sb3_cgp.scoring import q_score
-from sb3_cgp.zoo import register
 
 DTYPES = ("float32", "bfloat16")
 EPISODES = 20
@@ -89,38 +85,6 @@ def critic_overlaps(model: CGP, critic: ContinuousCritic) -> list[float]:
     return elite_overlaps(cem, exact, rounded, len(features), get_action_dim(model.action_space))
 
 
-def train(env_id: str, dtype: str, seed: int, steps: int | None, device: th.device) -> CGP:
-    """
-    Train as ``rl_zoo3.train --algo cgp`` does.
-
-    :param env_id: the environment
-    :param dtype: ``cem_dtype``
-    :param seed: the seed
-    :param steps: environment steps; None for what the YAML file says
-    :param device: where the networks compute
-    :return: the trained model
-    """
-    register()
-    hyperparams = {"cem_dtype": dtype} | ({} if steps is None else {"n_timesteps": steps})
-    with tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
-        manager = ExperimentManager(
-            argparse.Namespace(),
-            "cgp",
-            env_id,
-            folder,
-            hyperparams=hyperparams,
-            eval_freq=-1,
-            log_interval=-1,
-            verbose=0,
-            seed=seed,
-            device=str(device),
-        )
-        model, _ = manager.setup_experiment()  # type: ignore[misc]
-        manager.learn(model)
-    assert isinstance(model, CGP)
-    return model
-
-
 def run(env_id: str, dtype: str, seed: int, args: argparse.Namespace, argv: Sequence[str]) -> dict[str, Any]:
     """
     Train and evaluate once.
@@ -132,7 +96,8 @@ def run(env_id: str, dtype: str, seed: int, args: argparse.Namespace, argv: Sequ
     :param argv: its arguments, for the record
     :return: the record
     """
-    model = train(env_id, dtype, seed, args.steps, args.device)
+    hyperparams = {"cem_dtype": dtype} | ({} if args.steps is None else {"n_timesteps": args.steps})
+    model = train_by_zoo(env_id, hyperparams, seed, args.device)
     env = make_vec_env(env_id, seed=EVALUATION_SEED)
     returns, _ = evaluate_policy(model, env, EPISODES, return_episode_rewards=True)
     record = {

@@ -16,7 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from benchmark.arguments import continuous_environment, count, measuring_parser
 from benchmark.contenders import CONTENDERS, REFERENCE, RandomAgent, make_agent, takes_cem_dtype
-from benchmark.files import write_atomically, write_json
+from benchmark.files import publish
 from benchmark.provenance import conditions
 from benchmark.runtime_table import markdown
 from benchmark.timing import interleaved, ratio, summary
@@ -196,10 +196,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "burn_in_steps": burn_in_steps(args.episode_steps),
         "methods": measure(args),
     }
-    write_json(args.folder / "runtime.json", record)
-    text = markdown(record)
-    write_atomically(args.folder / "runtime.md", text.encode())
-    print(text)
+    publish(args.folder, "runtime", record, markdown(record))
 
 
 if __name__ == "__main__":

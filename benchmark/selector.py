@@ -16,7 +16,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
 from benchmark.arguments import count, measuring_parser
-from benchmark.files import markdown_table, write_atomically, write_json
+from benchmark.files import markdown_table, publish
 from benchmark.products import Sizes, bare_products, call_flops, outer_products, product_flops
 from benchmark.provenance import conditions, conditions_in_words
 from benchmark.timing import interleaved, ratio, summary
@@ -215,10 +215,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "rounds": args.rounds,
         "calls": measure(args),
     }
-    write_json(args.folder / "selector.json", record)
-    text = markdown(record)
-    write_atomically(args.folder / "selector.md", text.encode())
-    print(text)
+    publish(args.folder, "selector", record, markdown(record))
 
 
 if __name__ == "__main__":

@@ -334,7 +334,6 @@ class CGP(GradientAlgorithm):
         :raises ValueError: if a loss is NaN or infinite, unless the step is captured
         """
         trains_actor, updates_averages = turns
-        self._loss_watch.begin_step()
         # For n-step replay, discount factor is gamma**n_steps (when no early termination)
         discounts = batch.discounts if batch.discounts is not None else self.gamma
 

@@ -115,6 +115,7 @@ class GradientAlgorithm(LeanReplayAlgorithm):
             return self._gradient_step(batch, *turns)
 
         def step(*fields: th.Tensor) -> StepLosses:
+            self._loss_watch.begin_step()
             return self._gradient_step(ReplayBufferSamples(*fields), *turns)
 
         return StepLosses(*self._capture(turns)(step, *batch))  # type: ignore[arg-type]

@@ -2,10 +2,10 @@
 
 import pickle
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from environments import Doubles
 from gymnasium import spaces
 from stable_baselines3 import TD3, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
@@ -146,27 +146,14 @@ def test_rule_takes_sb3s_default_buffer_of_boxes_on_a_gpu_alone():
     assert not any(fits_device(buffer_class, VECTOR, False, gpu) for buffer_class in others)
 
 
-class Doubles(gym.Env):
-    """Random float64 observations; five steps an episode, of which some end by a timeout."""
+class Ending(Doubles):
+    """Some of its episodes end by a timeout, the others for good."""
 
-    observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
-    action_space = spaces.Box(-1, 1, (2,), np.float32)
-
-    def observe(self):
-        return self.np_random.normal(size=3)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return self.observe(), {}
-
-    def step(self, action):
-        self.steps += 1
-        ends, is_timeout = self.steps == 5, bool(self.np_random.random() < 0.5)
-        return self.observe(), float(action.sum()), ends and not is_timeout, ends and is_timeout, {}
+    def ends_by_timeout(self):
+        return bool(self.np_random.random() < 0.5)
 
 
-class Images(Doubles):
+class Images(Ending):
     """The same with images."""
 
     observation_space = spaces.Box(0, 255, (3, 36, 36), np.uint8)
@@ -175,7 +162,7 @@ class Images(Doubles):
         return self.np_random.integers(0, 256, (3, 36, 36), np.uint8)
 
 
-def make_env(n_envs=1, normalises=False, env_class=Doubles):
+def make_env(n_envs=1, normalises=False, env_class=Ending):
     env = DummyVecEnv([env_class] * n_envs)
     env.seed(0)
     return VecNormalize(env) if normalises else env
@@ -205,10 +192,10 @@ def cpu_counts(monkeypatch):
 @pytest.mark.parametrize(
     ("n_envs", "normalises", "env_class", "policy"),
     [
-        (1, False, Doubles, "MlpPolicy"),
-        (1, True, Doubles, "MlpPolicy"),
-        (3, False, Doubles, "MlpPolicy"),
-        (3, True, Doubles, "MlpPolicy"),
+        (1, False, Ending, "MlpPolicy"),
+        (1, True, Ending, "MlpPolicy"),
+        (3, False, Ending, "MlpPolicy"),
+        (3, True, Ending, "MlpPolicy"),
         (1, False, Images, "CnnPolicy"),
     ],
 )

@@ -1,13 +1,10 @@
 """Every variant learns: the paper's five on Pendulum, and CGP on a MuJoCo task."""
 
-import argparse
-
 import pytest
-from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_cgp import zoo
+from benchmark.training import train_by_zoo
 
 pytestmark = pytest.mark.slow
 
@@ -20,31 +17,18 @@ VARIANTS = {
 }
 
 
-def mean_return(env_id, tmp_path, **variant):
+def mean_return(env_id, **variant):
     """Train as `rl_zoo3.train --algo cgp` does, and evaluate over 20 episodes."""
-    zoo.register()
-    manager = ExperimentManager(
-        argparse.Namespace(),
-        "cgp",
-        env_id,
-        str(tmp_path),
-        hyperparams=variant,
-        eval_freq=-1,
-        log_interval=-1,
-        verbose=0,
-        seed=0,
-    )
-    model, _ = manager.setup_experiment()
-    manager.learn(model)
+    model = train_by_zoo(env_id, variant, seed=0)
     return evaluate_policy(model, make_vec_env(env_id, seed=1_000), n_eval_episodes=20)[0]
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_every_variant_swings_up_the_pendulum(variant, tmp_path):
+def test_every_variant_swings_up_the_pendulum(variant):
     # Random actions earn about -1200, the best known policies about -150
-    assert mean_return("Pendulum-v1", tmp_path, **VARIANTS[variant]) >= -200
+    assert mean_return("Pendulum-v1", **VARIANTS[variant]) >= -200
 
 
-def test_cgp_reaches_on_mujoco(tmp_path):
+def test_cgp_reaches_on_mujoco():
     # Random torques earn about -43, none at all -12
-    assert mean_return("Reacher-v5", tmp_path) >= -10
+    assert mean_return("Reacher-v5") >= -10

@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from environments import Doubles
 from gymnasium import spaces
 from stable_baselines3 import TD3, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
@@ -13,25 +14,6 @@ from sb3_cgp import CGP
 from sb3_cgp.replay import float32_space
 
 SMALL = dict(learning_starts=30, buffer_size=200, batch_size=8, cem_samples=8, cem_elites=2, seed=0, device="cpu")
-
-
-class Doubles(gym.Env):
-    """Random float64 observations, five steps an episode."""
-
-    observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
-    action_space = spaces.Box(-1, 1, (2,), np.float32)
-
-    def observe(self):
-        return self.np_random.normal(size=3)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return self.observe(), {}
-
-    def step(self, action):
-        self.steps += 1
-        return self.observe(), float(action.sum()), False, self.steps == 5, {}
 
 
 class Goals(Doubles):
