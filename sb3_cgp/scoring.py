@@ -17,8 +17,8 @@ from sb3_cgp.cem import Score
 # Hidden activations of one block, per thread: about what stays in a core's cache (1 MiB of float32)
 BLOCK_SIZE = 2**18
 
-# Maps hidden activations, (B N, H), given N, to the next ones, and may overwrite them
-Layer = Callable[[th.Tensor, int], th.Tensor]
+# Maps hidden activations, (B N, H), to the next ones, and may overwrite them
+Layer = Callable[[th.Tensor], th.Tensor]
 
 
 @functools.cache
@@ -69,12 +69,14 @@ def q_score(q_network: nn.Module, features: th.Tensor, dtype: th.dtype = th.floa
     :param q_network: maps features and actions side by side, (rows, F + A), to values, (rows, 1)
     :param features: the states' features, (B, F)
     :param dtype: data type of the hidden layers' products, which bfloat16 may make faster. Everything else is float32,
-        and so is all of a network that has layers with parameters that are not linear.
+        and so is all of a network that has other layers than linear ones and rectifiers between them.
     :return: the scoring function, (B, N, A) -> (B, N), without gradients
     """
-    if _begins_with_linear(q_network):
-        return _score_by_parts(q_network, features, dtype)
-    return repeated_q_score(q_network, features)
+    if not _begins_with_linear(q_network):
+        return repeated_q_score(q_network, features)
+    if dtype != th.float32 and _is_rectifier_network(q_network):
+        return _score_by_differences(q_network, features, dtype)
+    return _score_by_parts(q_network, features)
 
 
 def repeated_q_score(q_network: nn.Module, features: th.Tensor) -> Score:
@@ -93,50 +95,118 @@ def repeated_q_score(q_network: nn.Module, features: th.Tensor) -> Score:
     return score
 
 
-def _score_by_parts(q_network: nn.Sequential, features: th.Tensor, dtype: th.dtype) -> Score:
-    """Score with the first layer split into a part per state and a part per action, a block of states at a time."""
+def _score_by_parts(q_network: nn.Sequential, features: th.Tensor) -> Score:
+    """Score with the first layer split into a part per state and a part per action."""
     first, *following = q_network
     assert isinstance(first, nn.Linear)
-    weight, n_features, width = first.weight, features.shape[1], first.out_features
-    state_part = F.linear(features, weight[:, :n_features], first.bias).unsqueeze(1)  # (B, 1, H)
-    action_weight = weight[:, n_features:].t().contiguous()  # (A, H)
-    layers = _prepare(following, dtype)
+    state_part, action_weight = _split(first, features)
+    layers = _prepare(following)
 
     @th.no_grad()
     def score(actions: th.Tensor) -> th.Tensor:
-        n_states, n_actions, _ = actions.shape
-        values = actions.new_empty(n_states, n_actions)
-        # Only a CPU gains from blocks: on a GPU one large product is the fastest
-        rows = BLOCK_SIZE * th.get_num_threads() // width if actions.device.type == "cpu" else n_states * n_actions
-        step = max(rows // n_actions, 1)
-        for start in range(0, n_states, step):
-            block = slice(start, start + step)
-            block_actions = actions[block]
-            weights = action_weight.expand(len(block_actions), -1, -1)
-            hidden = th.baddbmm(state_part[block], block_actions, weights).flatten(0, 1)
+        def score_block(block: slice, block_actions: th.Tensor) -> th.Tensor:
+            hidden = _multiply_each(block_actions, action_weight, state_part[block])
             for layer in layers:
-                hidden = layer(hidden, n_actions)
-            values[block] = hidden.view(-1, n_actions)
-        return values
+                hidden = layer(hidden)
+            return hidden
+
+        return _in_blocks(score_block, actions, first.out_features)
 
     return score
 
 
-def _prepare(modules: list[nn.Module], dtype: th.dtype) -> list[Layer]:
+def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: th.dtype) -> Score:
+    """
+    Score by a network of linear layers and rectifiers, the products of whose hidden layers are in another data type.
+
+    ``relu(u + d) = relu(u) + max(d + min(u, 0), -relu(u))``, where u is what a unit has for the mean of a state's actions,
+    and d by how much it differs for one of them. What follows from u is computed once per state, in float32. Only
+    differences are rounded, which CEM ranks, and not what a state's actions have in common, which may be much larger.
+    """
+    first, *hidden, last = [module for module in q_network if _is_linear(module)]
+    state_part, action_weight = _split(first, features)
+    weights = [layer.weight.to(dtype) for layer in hidden]
+
+    @th.no_grad()
+    def score(actions: th.Tensor) -> th.Tensor:
+        common_actions = actions.mean(dim=1, keepdim=True)
+        common = [th.baddbmm(state_part, common_actions, action_weight.expand(len(actions), -1, -1)).squeeze(1)]  # (B, H) each
+        for layer in hidden:
+            common.append(_multiply(common[-1].relu(), layer.weight, layer.bias))
+        # The last hidden layer in fewer passes: relu(u + d) = u + max(d, -u)
+        common_values = F.linear(common[-1], last.weight, last.bias)
+        offsets = [values.clamp(max=0.0).unsqueeze(1) for values in common[:-1]]
+        floors = [values.relu().neg_().unsqueeze(1) for values in common[:-1]] + [common[-1].neg().unsqueeze(1)]
+
+        def score_block(block: slice, block_actions: th.Tensor) -> th.Tensor:
+            n_actions = block_actions.shape[1]
+            different = _multiply_each(block_actions - common_actions[block], action_weight, offsets[0][block])
+            for index, weight in enumerate(weights, start=1):
+                rectified = _clamp_each(different, floors[index - 1][block])
+                different = _multiply(rectified.to(dtype), weight).to(actions.dtype)
+                if index < len(weights):
+                    different.unflatten(0, (-1, n_actions)).add_(offsets[index][block])
+            values = F.linear(_clamp_each(different, floors[-1][block]), last.weight)
+            return values.view(-1, n_actions).add_(common_values[block])
+
+        return _in_blocks(score_block, actions, max(layer.out_features for layer in (first, *hidden)))
+
+    return score
+
+
+def _split(first: nn.Linear, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """Split a first layer into the states' part, (B, 1, H), and the weights of the actions' part, (A, H)."""
+    n_features = features.shape[1]
+    state_part = F.linear(features, first.weight[:, :n_features], first.bias).unsqueeze(1)
+    return state_part, first.weight[:, n_features:].t().contiguous()
+
+
+def _in_blocks(score_block: Callable[[slice, th.Tensor], th.Tensor], actions: th.Tensor, width: int) -> th.Tensor:
+    """Score a block of states at a time: their indices and actions (b, N, A) -> their values, b N in all."""
+    n_states, n_actions, _ = actions.shape
+    values = actions.new_empty(n_states, n_actions)
+    # Only a CPU gains from blocks: on a GPU one large product is the fastest
+    rows = BLOCK_SIZE * th.get_num_threads() // width if actions.device.type == "cpu" else n_states * n_actions
+    step = max(rows // n_actions, 1)
+    for start in range(0, n_states, step):
+        block = slice(start, start + step)
+        values[block] = score_block(block, actions[block]).view(-1, n_actions)
+    return values
+
+
+def _multiply_each(actions: th.Tensor, weight: th.Tensor, addends: th.Tensor) -> th.Tensor:
+    """Multiply each state's actions, (b, N, A), by weights, (A, H), and add the state's part, (b, 1, H): (b N, H)."""
+    return th.baddbmm(addends, actions, weight.expand(len(actions), -1, -1)).flatten(0, 1)
+
+
+def _clamp_each(hidden: th.Tensor, floors: th.Tensor) -> th.Tensor:
+    """Raise the activations of each state's actions, (b N, H), to the state's floors, (b, 1, H), in place."""
+    by_state = hidden.unflatten(0, (len(floors), -1))
+    th.maximum(by_state, floors, out=by_state)
+    return hidden
+
+
+def _prepare(modules: list[nn.Module]) -> list[Layer]:
     """Turn the modules after the first into layers."""
-    hidden_dtype = dtype if all(_is_linear(module) or _is_bare(module) for module in modules) else th.float32
     last = max((index for index, module in enumerate(modules) if _is_linear(module)), default=None)
     layers: list[Layer] = []
     is_fused = False
     for index, module in enumerate(modules):
         if _is_linear(module):
             is_fused = index != last and type(modules[index + 1]) is nn.ReLU
-            layers.append(_last_linear(module) if index == last else _hidden_linear(module, hidden_dtype, is_fused))
+            layers.append(_last_linear(module) if index == last else _hidden_linear(module, is_fused))
         elif is_fused:
             is_fused = False
         else:
             layers.append(_activation(module))
     return layers
+
+
+def _is_rectifier_network(q_network: nn.Sequential) -> bool:
+    """Whether a network has linear layers alone, at least three, and rectifiers between them."""
+    linear, rectifiers = list(q_network)[::2], list(q_network)[1::2]
+    alternates = all(map(_is_linear, linear)) and all(type(module) is nn.ReLU for module in rectifiers)
+    return alternates and len(linear) == len(rectifiers) + 1 > 2
 
 
 def _begins_with_linear(q_network: nn.Module) -> TypeGuard[nn.Sequential]:
@@ -156,42 +226,13 @@ def _is_hooked(module: nn.Module) -> bool:
     return bool(module._forward_hooks or module._forward_pre_hooks)
 
 
-def _is_bare(module: nn.Module) -> bool:
-    """Whether a module has neither parameters nor buffers, as activations have none: it works in any data type."""
-    return next(module.parameters(), None) is None and next(module.buffers(), None) is None
-
-
 def _activation(module: nn.Module) -> Layer:
-    if type(module) is nn.ReLU:
-        return lambda hidden, n_actions: hidden.relu_()
-    return lambda hidden, n_actions: module(hidden)
+    return th.relu_ if type(module) is nn.ReLU else module
 
 
-def _hidden_linear(linear: nn.Linear, dtype: th.dtype, is_rectified: bool) -> Layer:
+def _hidden_linear(linear: nn.Linear, is_rectified: bool) -> Layer:
     """Make a hidden linear layer and its rectifier."""
-    if dtype != th.float32:
-        return _rounded_linear(linear, dtype, is_rectified)
-    return lambda hidden, n_actions: _multiply(hidden, linear.weight, linear.bias, is_rectified)
-
-
-def _rounded_linear(linear: nn.Linear, dtype: th.dtype, is_rectified: bool) -> Layer:
-    """
-    Make a hidden linear layer that multiplies in another data type, and its rectifier.
-
-    ``W x + b = (W r + b) + W (x - r)``, where r is a state's mean input: only the differences between its actions are rounded,
-    which CEM ranks, and not what its actions have in common, which may be much larger.
-    """
-    weight = linear.weight.to(dtype)
-
-    def layer(hidden: th.Tensor, n_actions: int) -> th.Tensor:
-        inputs = hidden.unflatten(0, (-1, n_actions))
-        common = inputs.mean(dim=1, keepdim=True)
-        differences = inputs.sub_(common).flatten(0, 1).to(dtype)
-        outputs = _multiply(differences, weight).to(hidden.dtype)
-        outputs.unflatten(0, (-1, n_actions)).add_(_multiply(common.squeeze(1), linear.weight, linear.bias).unsqueeze(1))
-        return outputs.relu_() if is_rectified else outputs
-
-    return layer
+    return lambda hidden: _multiply(hidden, linear.weight, linear.bias, is_rectified)
 
 
 def _multiply(hidden: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None, is_rectified: bool = False) -> th.Tensor:
@@ -203,4 +244,4 @@ def _multiply(hidden: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = Non
 
 
 def _last_linear(linear: nn.Linear) -> Layer:
-    return lambda hidden, n_actions: F.linear(hidden, linear.weight, linear.bias)
+    return lambda hidden: F.linear(hidden, linear.weight, linear.bias)
