@@ -9,17 +9,8 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_cgp.captured import can_capture
 from sb3_cgp.validation import require
-
-
-def is_accelerator(device: th.device) -> bool:
-    """
-    Tell whether a device has a memory of its own, which copies from the host have to reach.
-
-    :param device: a model's device
-    :return: True for GPUs of CUDA, the only ones where the gain is known
-    """
-    return device.type == "cuda"
 
 
 def fits_device(
@@ -32,10 +23,26 @@ def fits_device(
     :param observation_space: observation space
     :param optimize_memory_usage: whether the buffer is to be SB3's memory efficient variant
     :param device: the model's device
-    :return: True for SB3's default class with ``Box`` observations on a GPU
+    :return: True for SB3's default class with ``Box`` observations on a GPU that has CUDA graphs
     """
     is_plain = buffer_class is ReplayBuffer and isinstance(observation_space, spaces.Box) and not optimize_memory_usage
-    return is_plain and is_accelerator(device)
+    return is_plain and can_capture(device)
+
+
+def leaves_room(observation_space: spaces.Space, buffer_size: int, device: th.device) -> bool:
+    """
+    Tell whether a :class:`DeviceReplayBuffer` leaves memory for networks, graphs and others' work.
+
+    :param observation_space: observation space, a ``Box``
+    :param buffer_size: number of transitions
+    :param device: a GPU
+    :return: whether its observations, by far the most of it, take at most half of what is free
+    """
+    assert isinstance(observation_space, spaces.Box)
+    # Floating point numbers are stored in float32 at most
+    needed = 2 * buffer_size * int(np.prod(observation_space.shape)) * min(observation_space.dtype.itemsize, 4)
+    free, _ = th.cuda.mem_get_info(device)
+    return needed <= free / 2
 
 
 def _stored(name: str) -> Any:

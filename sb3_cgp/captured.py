@@ -84,13 +84,17 @@ class Captured:
     One function of tensors that is recorded on a GPU after a few calls, and replayed from then on.
 
     It may change other tensors in place, such as parameters, which must stay where they are in memory. A function that makes
-    the host wait for the GPU cannot be recorded: a warning says so, and every call is carried out as usual.
+    the host wait for the GPU cannot be recorded, and the first replay is compared with a real call, from the same state and
+    random numbers. Where a recording cannot be had or trusted, a warning says so, and every call is carried out as usual.
+
+    :param list_state: lists the tensors that the function changes in place
     """
 
-    def __init__(self) -> None:
+    def __init__(self, list_state: Callable[[], Sequence[th.Tensor]] = list):
+        self._list_state = list_state
         self._recording: Recording | None = None
         self._eager_calls_left = EAGER_CALLS
-        self._waits = False
+        self._stays_eager = False
 
     def __call__(self, function: Callable[..., Tensors], *inputs: th.Tensor | None) -> Tensors:
         """
@@ -106,13 +110,50 @@ class Captured:
         with nullcontext() if gpu is None else th.cuda.device(gpu):
             if self._eager_calls_left > 0:
                 self._eager_calls_left -= 1
-                outputs, self._waits = _rehearse(function, inputs, gpu)
+                outputs, self._stays_eager = _rehearse(function, inputs, gpu)
                 return outputs
-            if self._recording is None and not self._waits:
-                self._recording = Recording(function, inputs)
+            if self._recording is None and not self._stays_eager:
+                return self._record(function, inputs, gpu)
             if self._recording is not None and self._recording.fits(inputs):
                 return self._recording.replay(inputs)
             return function(*inputs)
+
+    def _record(self, function: Callable[..., Tensors], inputs: Tensors, gpu: th.device | None) -> Tensors:
+        """Record the function, carry it out both ways, and keep the recording if they agree."""
+        generator = th.default_generator if gpu is None else th.cuda.default_generators[gpu.index]
+        recording = Recording(function, inputs)
+        random_state, before = generator.get_state(), _clones(self._list_state())
+        outputs = _clones(function(*inputs))
+        after = _clones(self._list_state())
+        _restore(self._list_state(), before)
+        generator.set_state(random_state)
+        replayed_outputs = recording.replay(inputs)
+        state = self._list_state()
+        zeros = tuple(None if output is None else th.zeros_like(output) for output in outputs)
+        if all(map(_have_changed_alike, (*state, *replayed_outputs), (*after, *outputs), (*before, *zeros))):
+            self._recording = recording
+            return replayed_outputs
+        message = "The CUDA graph of a step does not do what the step does: steps are carried out one operation at a time."
+        warnings.warn(f"{message} Please report it, with the versions of PyTorch and CUDA.", stacklevel=2)
+        _restore(state, after)
+        self._stays_eager = True
+        return outputs
+
+
+def _restore(tensors: Sequence[th.Tensor], values: Tensors) -> None:
+    with th.no_grad():
+        for tensor, value in zip(tensors, values, strict=True):
+            if value is not None:
+                tensor.copy_(value)
+
+
+def _have_changed_alike(tensor: th.Tensor | None, other: th.Tensor | None, start: th.Tensor | None) -> bool:
+    """Whether two tensors that were equal have changed alike; rounding may differ, and Adam magnifies what is close to 0."""
+    if tensor is None or other is None or start is None:
+        return tensor is other
+    values, others, starts = (each.detach().double().nan_to_num() for each in (tensor, other, start))
+    allowed = 0.1 * (others - starts).norm() + 1e-6 * others.norm()
+    return bool((values - others).norm() <= allowed)
 
 
 def _gpu_of(inputs: Tensors) -> th.device | None:
@@ -170,6 +211,11 @@ class LossWatch:
         """Count a gradient step."""
         self._step += 1
 
+    @property
+    def state(self) -> list[th.Tensor]:
+        """What a step changes in place."""
+        return [self._step, self._first_bad]
+
     def see(self, name: str, loss: th.Tensor) -> th.Tensor:
         """
         Look at a loss without reading it.
@@ -202,7 +248,7 @@ class LossWatch:
 
 def can_capture(device: th.device) -> bool:
     """
-    Tell whether a device has CUDA graphs.
+    Tell whether a device has CUDA graphs, and a memory of its own.
 
     :param device: the device
     :return: whether it is an NVIDIA GPU

@@ -91,7 +91,7 @@ class CGP(GradientAlgorithm):
     :param cuda_graphs: on a GPU, whether gradient steps and CEM's acting are recorded as CUDA graphs, and the replay buffer
         lies on the GPU, which is to compute the same in less time. What a selector of your own decides in Python is
         decided once, then. Has no effect on a CPU, nor with ``Dict`` observations or another optimiser than the
-        fused Adam. Off by default, as it has not been run on a GPU yet.
+        fused Adam.
     :param policy_loss: what the actor learns from: "cgp" imitates CEM, "qgp" climbs the critic's gradient,
         None trains no actor, so that CEM acts at inference too
     :param policy_training: "online" trains the actor along with the critics, "offline" when ``learn`` has finished
@@ -152,7 +152,7 @@ class CGP(GradientAlgorithm):
         cem_elites: int = 6,
         cem_result: str = "best",
         cem_dtype: str = "auto",
-        cuda_graphs: bool = False,
+        cuda_graphs: bool = True,
         policy_loss: str | None = "cgp",
         policy_training: str = "online",
         inference: str | None = None,

@@ -1,6 +1,5 @@
 """Off-policy algorithms whose gradient steps are watched for NaN, and are CUDA graphs on a GPU."""
 
-from collections import defaultdict
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,7 +69,7 @@ class GradientAlgorithm(LeanReplayAlgorithm):
                 self._captured_rates[optimizer] = th.tensor(float(optimizer.param_groups[0]["lr"]), device=self.device)
             set_capturable(optimizer, self._captured_rates.get(optimizer))
         # By what is due in a gradient step; None for acting
-        self._captures: defaultdict[tuple[bool, ...] | None, Captured] = defaultdict(Captured)
+        self._captures: dict[tuple[bool, ...] | None, Captured] = {}
         self._captured_settings: tuple[Any, ...] = ()
         self._loss_watch = LossWatch(("critic", "actor"), self._n_updates, self.device)
         self._unlogged_losses: dict[str, list[th.Tensor]] = {}
@@ -81,7 +80,20 @@ class GradientAlgorithm(LeanReplayAlgorithm):
         if settings != self._captured_settings:
             self._captures.clear()
             self._captured_settings = settings
+        if turns not in self._captures:
+            # Selecting actions changes nothing
+            self._captures[turns] = Captured() if turns is None else Captured(self._list_state)
         return self._captures[turns]
+
+    def _list_state(self) -> list[th.Tensor]:
+        """List the tensors that a gradient step changes in place."""
+        moments = [
+            value
+            for optimizer in (self.actor.optimizer, self.critic.optimizer)
+            for state in optimizer.state.values()
+            for value in state.values()
+        ]
+        return [*self.policy.parameters(), *self.policy.buffers(), *moments, *self._loss_watch.state]
 
     def _select_actions(self, observation: th.Tensor) -> tuple[th.Tensor | None, ...]:
         """Select actions for acting while training, as a CUDA graph."""

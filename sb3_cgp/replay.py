@@ -13,7 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_cgp.buffers import DeviceReplayBuffer, fits_device
+from sb3_cgp.buffers import DeviceReplayBuffer, fits_device, leaves_room
 
 SelfLeanReplayAlgorithm = TypeVar("SelfLeanReplayAlgorithm", bound="LeanReplayAlgorithm")
 
@@ -44,7 +44,7 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
     """
 
     # An argument of the algorithm's: the buffer lies on the GPU to be of use to them
-    cuda_graphs: bool = False
+    cuda_graphs: bool = True
     # Set by `load`, before the model is built
     _replay_buffer_deferred: bool = False
 
@@ -68,14 +68,14 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
             return self.replay_buffer
         assert self.replay_buffer_class is not None
         arguments = (self.replay_buffer_class, self.observation_space, self.optimize_memory_usage, self.device)
+        buffer_class = self.replay_buffer_class
         if self.cuda_graphs and fits_device(*arguments):
-            try:
-                self.replay_buffer = self._allocate(DeviceReplayBuffer)
-                return self.replay_buffer
-            except th.cuda.OutOfMemoryError:
-                message = f"A replay buffer of {self.buffer_size} does not fit on {self.device}: it is kept on the host."
-                warnings.warn(message, stacklevel=2)
-        self.replay_buffer = self._allocate(self.replay_buffer_class)
+            if leaves_room(self.observation_space, self.buffer_size, self.device):
+                buffer_class = DeviceReplayBuffer
+            else:
+                message = f"A replay buffer of {self.buffer_size} takes over half of {self.device}'s free memory"
+                warnings.warn(f"{message}: it is kept on the host.", stacklevel=2)
+        self.replay_buffer = self._allocate(buffer_class)
         return self.replay_buffer
 
     def _allocate(self, buffer_class: type[ReplayBuffer]) -> ReplayBuffer:

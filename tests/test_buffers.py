@@ -135,7 +135,9 @@ def test_pickle_is_of_numpy_arrays_and_goes_where_there_is_the_device(saved_from
         assert_same(samples(loaded), samples(buffer))
 
 
-def test_rule_takes_sb3s_default_buffer_of_boxes_on_a_gpu_alone():
+def test_rule_takes_sb3s_default_buffer_of_boxes_on_a_gpu_alone(monkeypatch):
+    # Whichever build of PyTorch this is
+    monkeypatch.setattr(th.version, "cuda", "13.0")
     gpu = th.device("cuda", 1)
     assert fits_device(ReplayBuffer, VECTOR, False, gpu)
     assert fits_device(ReplayBuffer, IMAGE, False, gpu)
@@ -174,7 +176,8 @@ def make_model(env, policy="MlpPolicy", **kwargs):
 
 
 def test_the_buffer_stays_sb3s_unless_asked_for(monkeypatch):
-    monkeypatch.setattr("sb3_cgp.buffers.is_accelerator", lambda device: True)
+    monkeypatch.setattr("sb3_cgp.buffers.can_capture", lambda device: True)
+    monkeypatch.setattr(th.cuda, "mem_get_info", lambda device: (2**30, 2**30))
     assert type(make_model(make_env(), cuda_graphs=False).replay_buffer) is ReplayBuffer
     assert type(make_model(make_env()).replay_buffer) is DeviceReplayBuffer
 
@@ -186,7 +189,8 @@ def parameters(model):
 @pytest.fixture
 def cpu_counts(monkeypatch):
     """Let the CPU count as a GPU."""
-    monkeypatch.setattr("sb3_cgp.buffers.is_accelerator", lambda device: True)
+    monkeypatch.setattr("sb3_cgp.buffers.can_capture", lambda device: True)
+    monkeypatch.setattr(th.cuda, "mem_get_info", lambda device: (2**30, 2**30))
 
 
 @pytest.mark.parametrize(
@@ -260,11 +264,11 @@ def test_other_buffers_are_allocated_as_they_are(cpu_counts):
 
 
 def test_a_gpu_without_enough_memory_leaves_the_buffer_to_the_host(cpu_counts, monkeypatch):
-    def full_gpu(*args, **kwargs):
-        raise th.cuda.OutOfMemoryError
-
-    monkeypatch.setattr("sb3_cgp.buffers.th.zeros", full_gpu)
-    with pytest.warns(UserWarning, match="A replay buffer of 60 does not fit on cpu: it is kept on the host"):
+    # 60 transitions with two observations of three float32 each
+    monkeypatch.setattr(th.cuda, "mem_get_info", lambda device: (2 * 60 * 2 * 3 * 4, 10**9))
+    assert type(make_model(make_env()).replay_buffer) is DeviceReplayBuffer
+    monkeypatch.setattr(th.cuda, "mem_get_info", lambda device: (2 * 60 * 2 * 3 * 4 - 1, 10**9))
+    with pytest.warns(UserWarning, match="A replay buffer of 60 takes over half of cpu's free memory: it is kept on the host"):
         model = make_model(make_env())
     monkeypatch.undo()
     assert type(model.replay_buffer) is ReplayBuffer

@@ -94,6 +94,36 @@ def test_captured_training_is_eager_training(stand_in, name):
     assert th.equal(parameters(taken), parameters(eager))
 
 
+@pytest.mark.parametrize("changes", [0, 2])
+def test_a_recording_that_does_something_else_is_noticed_and_not_used(stand_in, monkeypatch, changes):
+    """A graph that does nothing when it is replayed, or everything twice."""
+
+    class Wrong(StandIn):
+        def replay(self, inputs):
+            outputs = self.function(*inputs)
+            for _ in range(changes):
+                outputs = self.function(*inputs)
+            return captured._clones(outputs) if changes else tuple(None if each is None else 0 * each for each in outputs)
+
+    class Idle(Wrong):
+        def replay(self, inputs):
+            model_state = [tensor.clone() for tensor in self.state()]
+            outputs = super().replay(inputs)
+            captured._restore(self.state(), model_state)
+            return outputs
+
+    model = make_model(target_update_interval=1)
+    Idle.state = staticmethod(model._list_state)
+    monkeypatch.setattr(captured, "Recording", Wrong if changes else Idle)
+    with pytest.warns(UserWarning, match="The CUDA graph of a step does not do what the step does"):
+        model.learn(60)
+    assert all(capture._recording is None for turns, capture in model._captures.items() if turns is not None)
+    assert model._n_updates == 30
+    if changes == 0:
+        # Acting, too, was found out; random numbers went on as if nothing had been recorded
+        assert th.equal(parameters(model), parameters(make_model(target_update_interval=1, cuda_graphs=False).learn(60)))
+
+
 def test_every_combination_of_turns_is_recorded_once_and_acting_too(stand_in):
     make_model(policy_delay=2, target_update_interval=3).learn(30 + 6 * (EAGER_CALLS + 5))
     # Two by two turns, and the selection of actions
