@@ -79,16 +79,15 @@ class CEM:
         """
         mean = th.zeros(n_states, action_dim, device=device)
         std = th.ones(n_states, action_dim, device=device)
-        best = mean
+        elites = mean.unsqueeze(1)
         for _ in range(self.iterations):
             noise = th.randn(n_states, self.samples, action_dim, device=device)
             samples = th.addcmul(mean.unsqueeze(1), std.unsqueeze(1), noise)  # (B, N, A)
             values = score(th.tanh(samples))  # (B, N)
-            values = values.masked_fill(values.isnan(), -th.inf)
+            values = values.nan_to_num(nan=-th.inf, posinf=th.inf, neginf=-th.inf)
             winners = values.topk(self.elites, dim=1).indices  # (B, K), best first
             elites = samples.gather(1, winners.unsqueeze(2).expand(-1, -1, action_dim))  # (B, K, A)
             mean = elites.mean(dim=1)
             # Much faster here than `std`
             std = (elites - mean.unsqueeze(1)).square().mean(dim=1).sqrt()
-            best = elites[:, 0]
-        return Selection(actions=th.tanh(best if self.result == "best" else mean), spread=std)
+        return Selection(actions=th.tanh(elites[:, 0] if self.result == "best" else mean), spread=std)

@@ -17,6 +17,9 @@ from sb3_cgp.cem import Score
 # Hidden activations of one block, per thread: about what stays in a core's cache (1 MiB of float32)
 BLOCK_SIZE = 2**18
 
+# From which on another data type makes up for the operations that it adds
+MANY_STATES = 8
+
 # Maps hidden activations, (B N, H), to the next ones, and may overwrite them
 Layer = Callable[[th.Tensor], th.Tensor]
 
@@ -69,12 +72,12 @@ def q_score(q_network: nn.Module, features: th.Tensor, dtype: th.dtype = th.floa
     :param q_network: maps features and actions side by side, (rows, F + A), to values, (rows, 1)
     :param features: the states' features, (B, F)
     :param dtype: data type of the hidden layers' products, which bfloat16 may make faster. Everything else is float32,
-        and so is all of a network that has other layers than linear ones and rectifiers between them.
+        and so is all where states are few, or where a network has other layers than linear ones and rectifiers between them.
     :return: the scoring function, (B, N, A) -> (B, N), without gradients
     """
     if not _begins_with_linear(q_network):
         return repeated_q_score(q_network, features)
-    if dtype != th.float32 and _is_rectifier_network(q_network):
+    if dtype != th.float32 and len(features) >= MANY_STATES and _is_rectifier_network(q_network):
         return _score_by_differences(q_network, features, dtype)
     return _score_by_parts(q_network, features)
 
@@ -126,6 +129,7 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
     first, *hidden, last = [module for module in q_network if _is_linear(module)]
     state_part, action_weight = _split(first, features)
     weights = [layer.weight.to(dtype) for layer in hidden]
+    width = max(layer.out_features for layer in (first, *hidden))
 
     @th.no_grad()
     def score(actions: th.Tensor) -> th.Tensor:
@@ -138,18 +142,16 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
         offsets = [values.clamp(max=0.0).unsqueeze(1) for values in common[:-1]]
         floors = [values.relu().neg_().unsqueeze(1) for values in common[:-1]] + [common[-1].neg().unsqueeze(1)]
 
-        def score_block(block: slice, block_actions: th.Tensor) -> th.Tensor:
-            n_actions = block_actions.shape[1]
-            different = _multiply_each(block_actions - common_actions[block], action_weight, offsets[0][block])
+        def score_block(block: slice, different_actions: th.Tensor) -> th.Tensor:
+            different = _multiply_each(different_actions, action_weight, offsets[0][block])
             for index, weight in enumerate(weights, start=1):
                 rectified = _clamp_each(different, floors[index - 1][block])
                 different = _multiply(rectified.to(dtype), weight).to(actions.dtype)
                 if index < len(weights):
-                    different.unflatten(0, (-1, n_actions)).add_(offsets[index][block])
-            values = F.linear(_clamp_each(different, floors[-1][block]), last.weight)
-            return values.view(-1, n_actions).add_(common_values[block])
+                    different.unflatten(0, (-1, actions.shape[1])).add_(offsets[index][block])
+            return F.linear(_clamp_each(different, floors[-1][block]), last.weight)
 
-        return _in_blocks(score_block, actions, max(layer.out_features for layer in (first, *hidden)))
+        return _in_blocks(score_block, actions - common_actions, width).add_(common_values)
 
     return score
 
@@ -164,10 +166,12 @@ def _split(first: nn.Linear, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]
 def _in_blocks(score_block: Callable[[slice, th.Tensor], th.Tensor], actions: th.Tensor, width: int) -> th.Tensor:
     """Score a block of states at a time: their indices and actions (b, N, A) -> their values, b N in all."""
     n_states, n_actions, _ = actions.shape
-    values = actions.new_empty(n_states, n_actions)
     # Only a CPU gains from blocks: on a GPU one large product is the fastest
     rows = BLOCK_SIZE * th.get_num_threads() // width if actions.device.type == "cpu" else n_states * n_actions
     step = max(rows // n_actions, 1)
+    if step >= n_states:
+        return score_block(slice(None), actions).view(n_states, n_actions)
+    values = actions.new_empty(n_states, n_actions)
     for start in range(0, n_states, step):
         block = slice(start, start + step)
         values[block] = score_block(block, actions[block]).view(-1, n_actions)

@@ -104,8 +104,11 @@ def test_bfloat16_rounds_differences_between_actions_and_nothing_else(monkeypatc
     if not with_onednn:
         monkeypatch.setattr(scoring, "_onednn_linear", lambda dtype: None)
     network = mlp([32, 64, 16])
-    features = th.randn(4, N_FEATURES)
-    actions = th.rand(4, 6, ACTION_DIM) * 2 - 1
+    features = th.randn(scoring.MANY_STATES, N_FEATURES)
+    actions = th.rand(scoring.MANY_STATES, 6, ACTION_DIM) * 2 - 1
+    # Few states are scored in float32
+    few = slice(scoring.MANY_STATES - 1)
+    assert th.equal(*(q_score(network, features[few], dtype)(actions[few]) for dtype in (th.float32, th.bfloat16)))
     scores = q_score(network, features, th.bfloat16)(actions)
     exact = repeated_q_score(network, features)(actions)
     assert scores.dtype == th.float32
