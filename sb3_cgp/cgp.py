@@ -25,10 +25,11 @@ from sb3_cgp.cem import CEM
 from sb3_cgp.diagnostics import policy_diagnostics
 from sb3_cgp.export import export_policy
 from sb3_cgp.exported import ExportedPolicy, load_weights
-from sb3_cgp.gradient import GradientAlgorithm, StepLosses
+from sb3_cgp.gradient import StepLosses
 from sb3_cgp.losses import bootstrap_target, cgp_loss, critic_loss, qgp_loss, smooth_target_actions
 from sb3_cgp.offline import descend_to_plateau
 from sb3_cgp.policies import CGPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_cgp.resumable import ResumableAlgorithm
 from sb3_cgp.validation import (
     LINEAR_SCHEDULE_PREFIX,
     check_action_space,
@@ -51,7 +52,7 @@ def _as_schedule(rate: float | Schedule | str) -> Schedule:
     return FloatSchedule(rate)
 
 
-class CGP(GradientAlgorithm):
+class CGP(ResumableAlgorithm):
     """
     Cross-Entropy Guided Policies (CGP).
 
@@ -222,7 +223,7 @@ class CGP(GradientAlgorithm):
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         # The first place that sees every environment's action space, before SB3's assertions, which name no value
-        env = GradientAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        env = ResumableAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         check_action_space(env.action_space)
         return env
 
@@ -321,6 +322,7 @@ class CGP(GradientAlgorithm):
             if self._n_updates % DIAGNOSTICS_INTERVAL == 0:
                 self._log_diagnostics(batch.observations, has_actor=self._trains_policy_online)
 
+        self._policy_is_due = self.policy_training == "offline"
         self._log_training(gradient_steps)
         self._record_losses(losses)
 
@@ -428,18 +430,20 @@ class CGP(GradientAlgorithm):
         :return: the trained model
         :raises ValueError: if a reward, an observation or a loss is NaN or infinite
         """
-        n_updates = self._n_updates
-        super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
+        try:
+            super().learn(
+                total_timesteps=total_timesteps,
+                callback=callback,
+                log_interval=log_interval,
+                tb_log_name=tb_log_name,
+                reset_num_timesteps=reset_num_timesteps,
+                progress_bar=progress_bar,
+            )
+        finally:
+            self._release_signals()
         self._loss_watch.check()
         # Without a gradient step of the critics, there is nothing new for the policy to learn
-        if self.policy_training == "offline" and self._n_updates > n_updates:
+        if self._policy_is_due:
             self.train_policy(callback=callback, progress_bar=progress_bar)
         return self
 
@@ -498,13 +502,17 @@ class CGP(GradientAlgorithm):
         # Callbacks score and save the actor that is being trained
         is_trained, self._policy_is_trained = self._policy_is_trained, True
         self._choose_inference()
+        self.is_training_policy = True
         try:
             callback = self._init_callback(callback)
             n_steps, is_enough = descend_to_plateau(step, after_round, callback, max_steps, self.n_envs, progress_bar)
             is_trained = is_trained or is_enough
+            self._policy_is_due = False
         finally:
             self._policy_is_trained = is_trained
             self._choose_inference()
+            self.is_training_policy = False
+            self._release_signals()
         if self.verbose >= 1:
             print(f"The policy was trained for {n_steps} gradient steps")
         return self
