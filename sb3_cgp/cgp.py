@@ -25,6 +25,7 @@ from sb3_cgp.cem import CEM
 from sb3_cgp.diagnostics import policy_diagnostics
 from sb3_cgp.export import export_policy
 from sb3_cgp.exported import ExportedPolicy, load_weights
+from sb3_cgp.faults import BoundsWatch, check_reward, check_shape, guarded
 from sb3_cgp.gradient import StepLosses
 from sb3_cgp.losses import bootstrap_target, cgp_loss, critic_loss, qgp_loss, smooth_target_actions
 from sb3_cgp.offline import descend_to_plateau
@@ -265,7 +266,11 @@ class CGP(ResumableAlgorithm):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
         first_obs = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
+        assert first_obs is not None
+        check_shape("observation", first_obs, self.observation_space, self.n_envs, self.num_timesteps)
         check_finite("observation", first_obs, self.num_timesteps)
+        self._bounds_watch = BoundsWatch(self.observation_space)
+        self._bounds_watch.check(first_obs, self.num_timesteps)
         self._learnt_normalized = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
         self._timesteps_trained_at = max(self.num_timesteps, self.learning_starts)
         return total_timesteps, callback
@@ -290,10 +295,16 @@ class CGP(ResumableAlgorithm):
         normalizer = self._vec_normalize_env
         original_reward = reward if normalizer is None else normalizer.get_original_reward()
         original_obs = new_obs if normalizer is None else normalizer.get_original_obs()
+        check_reward(original_reward, self.n_envs, self.num_timesteps)
+        check_shape("observation", original_obs, self.observation_space, self.n_envs, self.num_timesteps)
         check_finite("reward", original_reward, self.num_timesteps)
         check_finite("observation", original_obs, self.num_timesteps)
+        self._bounds_watch.check(original_obs, self.num_timesteps)
         for info, done in zip(infos, dones, strict=True):
             if done and info.get("terminal_observation") is not None:
+                check_shape(
+                    "terminal observation", info["terminal_observation"], self.observation_space, None, self.num_timesteps
+                )
                 check_finite("terminal observation", info["terminal_observation"], self.num_timesteps)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
@@ -408,6 +419,7 @@ class CGP(ResumableAlgorithm):
             self.logger.record_mean(key, value)
         self.policy.set_training_mode(True)
 
+    @guarded
     def learn(
         self: SelfCGP,
         total_timesteps: int,
@@ -428,7 +440,8 @@ class CGP(ResumableAlgorithm):
         :param reset_num_timesteps: whether or not to reset the current timestep number (used in logging)
         :param progress_bar: Display a progress bar using tqdm and rich.
         :return: the trained model
-        :raises ValueError: if a reward, an observation or a loss is NaN or infinite
+        :raises ValueError: if a reward, an observation or a loss is NaN or infinite, or of a wrong shape
+        :raises RuntimeError: if a worker of a ``SubprocVecEnv`` has died
         """
         try:
             super().learn(
@@ -550,7 +563,7 @@ class CGP(ResumableAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "actor_target", "critic", "critic_target"]
-        return [*super()._excluded_save_params(), *aliases, "_actor_lr_schedule"]
+        return [*super()._excluded_save_params(), *aliases, "_actor_lr_schedule", "_bounds_watch"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts = ["policy", "actor.optimizer", "critic.optimizer"]
