@@ -6,6 +6,7 @@ A state is a tree of plain data, arrays and tensors (:mod:`sb3_cgp.store`). What
 
 import inspect
 import io
+import os
 import random
 import warnings
 from collections import Counter
@@ -55,6 +56,7 @@ def gather(model: "ResumableAlgorithm", callback: BaseCallback) -> State:
         "statistics": None if normalizer is None else plain_attributes(normalizer, without=_all_but(normalizer, STATISTICS)),
         "callbacks": [_callback_state(each, model.env) for each in walk(callback)],
         "logger": _pending(model.logger),
+        "log_folder": None if model.logger.dir is None else os.path.abspath(model.logger.dir),
         "random": _random_state(model),
     }
 
