@@ -1,10 +1,14 @@
 """What happens when an environment or the machine fails: the table of docs/trust.md, a test for each row."""
 
+import errno
 import multiprocessing
 import os
+import re
 import signal
+import stat
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +19,11 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_cgp import CGP
+from sb3_cgp.callbacks import TrainingCheckpointCallback
 from sb3_cgp.faults import BoundsWatch
+from sb3_cgp.store import StateStore
+
+ROOT = Path(__file__).parent.parent
 
 SMALL = dict(buffer_size=200, learning_starts=10, batch_size=8, cem_samples=8, cem_elites=2, policy_kwargs=dict(net_arch=[8]))
 
@@ -33,6 +41,13 @@ class Failing(Doubles):
         self.total += 1
         values = super().step(action)
         return values if self.fault is None or self.total != self.at else self.fault(*values)
+
+    def get_training_state(self):
+        return {"steps": self.steps, "total": self.total, "random": self.np_random.bit_generator.state}
+
+    def set_training_state(self, state):
+        self.steps, self.total = state["steps"], state["total"]
+        self.np_random.bit_generator.state = state["random"]
 
 
 def raise_error(*_):
@@ -244,3 +259,74 @@ def test_the_bounds_of_each_part_of_an_observation_are_watched():
     watch.check(inside, 3)
     with pytest.warns(UserWarning, match=r"an observation `position` .* step 4: value 2.0 at index \(1,\)"):
         watch.check({**inside, "position": np.array([[0.0, 2.0]])}, 4)
+
+
+def learn(folder, fault=None, at=73, model=None, function=None):
+    """Train for 150 steps, the state saved after every 20, with a fault of the environment or of the process."""
+    model = CGP("MlpPolicy", Failing(fault, at), **SMALL, seed=0) if model is None else model
+    return model.learn(150, [TrainingCheckpointCallback(20, folder), AtStep(at if function else None, function)])
+
+
+def assert_resumes(folder, step, expected):
+    """The newest state is that of a step, and the training goes on to the end that it would have had."""
+    assert max(StateStore(folder).steps()) == step
+    model = learn(folder, model=CGP.resume(folder, Failing()))
+    assert model.num_timesteps == 150
+    for name, parameter in expected.policy.state_dict().items():
+        np.testing.assert_array_equal(model.policy.state_dict()[name].numpy(), parameter.numpy(), err_msg=name)
+
+
+def test_the_last_state_resumes_after_an_environment_has_raised(tmp_path):
+    with pytest.raises(ZeroDivisionError, match=r"^the simulator is unstable$"):
+        learn(tmp_path / "failed", raise_error)
+    assert_resumes(tmp_path / "failed", 60, learn(tmp_path / "straight"))
+
+
+@pytest.mark.parametrize("fault", [with_observation(np.full(3, np.nan)), with_observation(np.ones(1)), with_reward(None)])
+def test_the_last_state_resumes_after_a_value_was_refused(fault, tmp_path):
+    with pytest.raises(ValueError, match="The environment returned"):
+        learn(tmp_path / "failed", fault)
+    assert_resumes(tmp_path / "failed", 60, learn(tmp_path / "straight"))
+
+
+# A state is a file of arrays, and one that names it
+@pytest.mark.parametrize(("n_written", "last"), [(0, 60), (1, 60), (2, 80)])
+def test_the_older_state_resumes_after_the_disk_was_full(n_written, last, tmp_path, monkeypatch):
+    folder, expected = tmp_path / "failed", learn(tmp_path / "straight")
+    written, fsync = [], os.fsync
+
+    def fill(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            return
+        written.append(descriptor)
+        if len(written) > n_written:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        fsync(descriptor)
+
+    with pytest.raises(OSError, match=r"No space left on device.*: '.*failed/.*'") as caught:
+        learn(folder, at=61, function=lambda: monkeypatch.setattr("os.fsync", fill))
+    assert caught.value.errno == errno.ENOSPC
+    assert Path(caught.value.filename).is_relative_to(folder)
+    assert not [path for path in folder.rglob("*") if "partial" in path.name]
+    monkeypatch.setattr("os.fsync", fsync)
+    assert_resumes(folder, last, expected)
+
+
+def test_sigterm_saves_the_state_and_ends_the_process(tmp_path):
+    handler = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as caught:
+        learn(tmp_path / "stopped", function=lambda: os.kill(os.getpid(), signal.SIGTERM))
+    assert caught.value.code == 143
+    assert signal.getsignal(signal.SIGTERM) is handler
+    assert_resumes(tmp_path / "stopped", 73, learn(tmp_path / "straight"))
+
+
+def test_every_fault_in_the_documentation_has_its_test():
+    section = (ROOT / "docs" / "trust.md").read_text().partition("## Faults\n")[2].partition("\n## ")[0]
+    rows = [line for line in section.splitlines() if line.startswith("| ")][2:]
+    assert len(rows) > 10
+    for row in rows:
+        named = re.findall(r"`tests/(test_\w+\.py)::(test_\w+)`", row.split(" | ")[-1])
+        assert named, row
+        for file, test in named:
+            assert f"def {test}(" in (ROOT / "tests" / file).read_text(), test
