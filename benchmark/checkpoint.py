@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from sb3_cgp.store import StateStore
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from benchmark.arguments import continuous_environment, count, measuring_parser
@@ -22,6 +21,7 @@ from benchmark.provenance import conditions, conditions_in_words
 from benchmark.timing import summary, timed
 from sb3_cgp import CGP
 from sb3_cgp.checkpoint import gather
+from sb3_cgp.store import StateStore
 
 NOTES = """\
 Seconds for which training stands still, on {env} with a replay buffer of {transitions} transitions, all of them filled, and

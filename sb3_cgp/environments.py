@@ -9,8 +9,9 @@ What is known to be restorable:
   :class:`RestorableEnv`,
 - whatever else, environment, wrapper or vectorised environment, has two methods of its own:
   ``get_training_state()`` returns the object's state as plain data (see :func:`sb3_cgp.attributes.to_plain`), or ``None``
-  if it cannot be restored now, and ``set_training_state(state)`` puts it back. An environment within a wrapper has its own;
-  ``np_random``, the spaces' random generators and a MuJoCo environment's ``data`` are saved along with it.
+  if it cannot be restored now, and ``set_training_state(state)`` puts it back; both may be called before the first
+  ``reset``. An environment within a wrapper has its own; ``np_random``, the spaces' random generators and a MuJoCo
+  environment's ``data`` are saved along with it.
 
 Specs, spaces (but for their random generators), renderers, files, modules and functions are taken to hold no state, and the
 time on the clock, what an environment was constructed with and how it is rendered to be no part of it. Anything else that

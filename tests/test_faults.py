@@ -34,7 +34,7 @@ class Failing(Doubles):
     """Calls a function at a step, and returns what it makes of the step's five values."""
 
     def __init__(self, fault=None, at=15, observation_space=Doubles.observation_space):
-        self.fault, self.at, self.total = fault, at, 0
+        self.fault, self.at, self.total, self.steps = fault, at, 0, 0
         self.observation_space = observation_space
 
     def step(self, action):
