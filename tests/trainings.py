@@ -89,7 +89,7 @@ class Training:
                 model = CGP.resume(self.folder / "state", self.make_env(seed=100 + stop))
         return self.learn(model, None)
 
-    def learn(self, model, stop):
+    def learn(self, model, stop, *callbacks):
         model.set_logger(Logger(None, [self.written]))
         checkpoint = TrainingCheckpointCallback(self.save_freq, self.folder / "state")
         self.evaluation = EvalCallback(
@@ -99,7 +99,7 @@ class Training:
             log_path=str(self.folder),
             verbose=0,
         )
-        return model.learn(self.steps, callback=[checkpoint, self.evaluation, Stop(stop)], log_interval=1)
+        return model.learn(self.steps, callback=[checkpoint, self.evaluation, Stop(stop), *callbacks], log_interval=1)
 
 
 def fingerprint(training, model):
