@@ -15,10 +15,12 @@ LOGS := logs
 # Hyperparameters to override, and any other option of rl_zoo3.train.
 PARAMS :=
 ARGS :=
+# The folder of a run to resume.
+RUN :=
 
 PYTHON ?= python3
 VENV := .venv
-RUN := $(VENV)/bin/python
+IN_VENV := $(VENV)/bin/python
 
 INSTALLED := $(VENV)/.installed
 TESTS_INSTALLED := $(VENV)/.installed-tests
@@ -26,7 +28,7 @@ TESTS_INSTALLED := $(VENV)/.installed-tests
 REQUIREMENTS := setup.cfg pyproject.toml constraints.txt _build_backend.py sb3_cgp/version.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help train test test-slow lint format clean
+.PHONY: help train resume test test-slow lint format clean
 
 help: ## list the goals
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -38,28 +40,33 @@ help: ## list the goals
 	@echo "Every goal that needs Python takes PYTHON=$(PYTHON) (3.10 or newer)."
 
 train: $(INSTALLED) ## install, train with rl_zoo3, evaluate and draw the learning curve
-	@plan=$$($(RUN) -m benchmark.plan --algo $(ALGO) --env $(ENV) --folder "$(LOGS)" $(if $(STEPS),--steps $(STEPS))) && \
+	@plan=$$($(IN_VENV) -m benchmark.plan --algo $(ALGO) --env $(ENV) --folder "$(LOGS)" $(if $(STEPS),--steps $(STEPS))) && \
 	set -- $$plan && \
-	(set -x; $(RUN) -m rl_zoo3.train --algo $(ALGO) --env $(ENV) --seed $(SEED) --num-threads $(THREADS) \
+	(set -x; $(IN_VENV) -m rl_zoo3.train --algo $(ALGO) --env $(ENV) --seed $(SEED) --num-threads $(THREADS) \
 	  $(if $(STEPS),--n-timesteps $(STEPS)) \
 	  --eval-freq $(or $(EVAL_FREQ),$$1) --eval-episodes $(EVAL_EPISODES) --log-folder "$(LOGS)" --progress \
 	  $(if $(PARAMS),-params $(PARAMS)) $(ARGS)) && \
-	$(RUN) -m benchmark.report --algo $(ALGO) --env $(ENV) --folder "$(LOGS)" --exp-id $$2
+	$(IN_VENV) -m benchmark.report --algo $(ALGO) --env $(ENV) --folder "$(LOGS)" --exp-id $$2
+
+resume: $(INSTALLED) ## go on with an interrupted run of CGP to its end, and report: make resume RUN=logs/cgp/Pendulum-v1_1
+	@test -n "$(RUN)" || { echo "Name the run's folder, as in: make resume RUN=logs/cgp/Pendulum-v1_1" >&2; exit 1; }
+	$(IN_VENV) -m sb3_cgp.resume "$(RUN)"
+	$(IN_VENV) -m benchmark.report --run "$(RUN)"
 
 test: lint ## install, lint and run the quick tests, with coverage
-	$(RUN) -m pytest -m "not slow" --cov=sb3_cgp --cov-report=term-missing:skip-covered --cov-fail-under=95
+	$(IN_VENV) -m pytest -m "not slow" --cov=sb3_cgp --cov-report=term-missing:skip-covered --cov-fail-under=95
 
 test-slow: $(TESTS_INSTALLED) ## run the tests that take minutes: learning, packaging
-	$(RUN) -m pytest -m slow --durations=10
+	$(IN_VENV) -m pytest -m slow --durations=10
 
 lint: $(TESTS_INSTALLED) ## ruff, black and mypy, changing nothing
-	$(RUN) -m ruff check .
-	$(RUN) -m black --check .
-	$(RUN) -m mypy
+	$(IN_VENV) -m ruff check .
+	$(IN_VENV) -m black --check .
+	$(IN_VENV) -m mypy
 
 format: $(TESTS_INSTALLED) ## let ruff and black mend what they can
-	$(RUN) -m ruff check --fix .
-	$(RUN) -m black .
+	$(IN_VENV) -m ruff check --fix .
+	$(IN_VENV) -m black .
 
 clean: ## remove the virtual environment, build artefacts and caches; trained models stay
 	rm -rf $(VENV) build dist ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage .coverage.* htmlcov
@@ -73,10 +80,10 @@ $(INSTALLED): $(REQUIREMENTS)
 	  echo "Name a newer one, as in: make PYTHON=python3.12 $(or $(MAKECMDGOALS),train)" >&2; exit 1; }
 	test -e $@ || $(PYTHON) -m venv --clear $(VENV)
 	rm -f $(INSTALLED) $(TESTS_INSTALLED)
-	$(RUN) -m pip install -c constraints.txt -e .
+	$(IN_VENV) -m pip install -c constraints.txt -e .
 	touch $@
 
 $(TESTS_INSTALLED): $(INSTALLED)
 	rm -f $(INSTALLED)
-	$(RUN) -m pip install -c constraints.txt -e ".[tests]"
+	$(IN_VENV) -m pip install -c constraints.txt -e ".[tests]"
 	touch $(INSTALLED) $@

@@ -1,25 +1,11 @@
 """Writing results: whole files or none, and Markdown for people beside JSON for programs."""
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """
-    Write a file so that whoever looks sees the old one or the new one, never a part.
-
-    :param path: the file
-    :param content: what it shall hold
-    """
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        beside.write_bytes(content)
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+from sb3_cgp.files import write_atomically
 
 
 def write_json(path: Path, record: dict[str, Any]) -> None:

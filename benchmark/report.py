@@ -29,8 +29,9 @@ from stable_baselines3.common.monitor import get_monitor_files, load_results
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from benchmark.files import write_atomically, write_json
+from benchmark.files import write_json
 from benchmark.provenance import commit, machine, package_versions
+from sb3_cgp.files import write_atomically
 
 # Far from the seeds that people train with: rl_zoo3 gives the training's environments the run's own
 EVALUATION_SEED = 10_000
@@ -134,6 +135,24 @@ def find_run(folder: str, algo: str, env_id: str, exp_id: int = 0) -> Run:
             "or name another run with --exp-id"
         ) from error
     return Run(algo, env_name, Path(run_folder), Path(model_path))
+
+
+def run_in(folder: Path) -> Run:
+    """
+    Find the run of a folder.
+
+    :param folder: the run's folder
+    :return: the run
+    :raises FileNotFoundError: if it is no run's folder, or has no final model
+    """
+    settings = next(folder.glob("*/args.yml"), None)
+    if settings is None:
+        raise FileNotFoundError(f"{folder} is no folder of a run, such as logs/cgp/Pendulum-v1_1: no args.yml in it")
+    model_path = folder / f"{settings.parent.name}.zip"
+    if not model_path.is_file():
+        raise FileNotFoundError(f"No trained model in {folder}: wait until its training has ended")
+    args = yaml.load(settings.read_text(), Loader=yaml.UnsafeLoader)
+    return Run(args["algo"], EnvironmentName(args["env"]), folder, model_path)
 
 
 def evaluation_env_kwargs(run: Run) -> dict[str, Any]:
@@ -360,13 +379,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--env", default="Pendulum-v1", help="environment (default: %(default)s)")
     parser.add_argument("--folder", default="logs", help="rl_zoo3's log folder (default: %(default)s)")
     parser.add_argument("--exp-id", default=0, type=int, help="number of the run (default: 0, the latest)")
+    parser.add_argument("--run", type=Path, help="the run's folder, in place of the four above")
     parser.add_argument("--episodes", default=20, type=int, help="episodes of the final evaluation (default: %(default)s)")
     parser.add_argument(
         "--seed", default=EVALUATION_SEED, type=int, help="seed of the final evaluation (default: %(default)s)"
     )
     args = parser.parse_args(argv)
     try:
-        run = find_run(args.folder, args.algo, args.env, args.exp_id)
+        run = run_in(args.run) if args.run else find_run(args.folder, args.algo, args.env, args.exp_id)
     except FileNotFoundError as error:
         sys.exit(f"Error: {error}")
     print(summary(run, report(run, args.episodes, args.seed)))

@@ -19,11 +19,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from benchmark.arguments import continuous_environment, count, measuring_parser
 from benchmark.boxes import BoxEnv
-from benchmark.files import write_atomically, write_json
+from benchmark.files import write_json
 from benchmark.provenance import conditions
 from benchmark.scaling_figure import draw
 from benchmark.timing import interleaved, summary
 from sb3_cgp import CGP
+from sb3_cgp.files import write_atomically
 
 BATCH_SIZE = 128
 # Random steps before the first gradient step

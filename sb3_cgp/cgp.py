@@ -25,10 +25,12 @@ from sb3_cgp.cem import CEM
 from sb3_cgp.diagnostics import policy_diagnostics
 from sb3_cgp.export import export_policy
 from sb3_cgp.exported import ExportedPolicy, load_weights
-from sb3_cgp.gradient import GradientAlgorithm, StepLosses
+from sb3_cgp.faults import BoundsWatch, check_reward, check_shape, guarded
+from sb3_cgp.gradient import StepLosses
 from sb3_cgp.losses import bootstrap_target, cgp_loss, critic_loss, qgp_loss, smooth_target_actions
 from sb3_cgp.offline import descend_to_plateau
 from sb3_cgp.policies import CGPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_cgp.resumable import ResumableAlgorithm
 from sb3_cgp.validation import (
     LINEAR_SCHEDULE_PREFIX,
     check_action_space,
@@ -51,7 +53,7 @@ def _as_schedule(rate: float | Schedule | str) -> Schedule:
     return FloatSchedule(rate)
 
 
-class CGP(GradientAlgorithm):
+class CGP(ResumableAlgorithm):
     """
     Cross-Entropy Guided Policies (CGP).
 
@@ -222,7 +224,7 @@ class CGP(GradientAlgorithm):
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         # The first place that sees every environment's action space, before SB3's assertions, which name no value
-        env = GradientAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        env = ResumableAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         check_action_space(env.action_space)
         return env
 
@@ -264,7 +266,11 @@ class CGP(GradientAlgorithm):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
         first_obs = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
+        assert first_obs is not None
+        check_shape("observation", first_obs, self.observation_space, self.n_envs, self.num_timesteps)
         check_finite("observation", first_obs, self.num_timesteps)
+        self._bounds_watch = BoundsWatch(self.observation_space)
+        self._bounds_watch.check(first_obs, self.num_timesteps)
         self._learnt_normalized = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
         self._timesteps_trained_at = max(self.num_timesteps, self.learning_starts)
         return total_timesteps, callback
@@ -289,10 +295,16 @@ class CGP(GradientAlgorithm):
         normalizer = self._vec_normalize_env
         original_reward = reward if normalizer is None else normalizer.get_original_reward()
         original_obs = new_obs if normalizer is None else normalizer.get_original_obs()
+        check_reward(original_reward, self.n_envs, self.num_timesteps)
+        check_shape("observation", original_obs, self.observation_space, self.n_envs, self.num_timesteps)
         check_finite("reward", original_reward, self.num_timesteps)
         check_finite("observation", original_obs, self.num_timesteps)
+        self._bounds_watch.check(original_obs, self.num_timesteps)
         for info, done in zip(infos, dones, strict=True):
             if done and info.get("terminal_observation") is not None:
+                check_shape(
+                    "terminal observation", info["terminal_observation"], self.observation_space, None, self.num_timesteps
+                )
                 check_finite("terminal observation", info["terminal_observation"], self.num_timesteps)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
@@ -321,6 +333,7 @@ class CGP(GradientAlgorithm):
             if self._n_updates % DIAGNOSTICS_INTERVAL == 0:
                 self._log_diagnostics(batch.observations, has_actor=self._trains_policy_online)
 
+        self._policy_is_due = self.policy_training == "offline"
         self._log_training(gradient_steps)
         self._record_losses(losses)
 
@@ -406,6 +419,7 @@ class CGP(GradientAlgorithm):
             self.logger.record_mean(key, value)
         self.policy.set_training_mode(True)
 
+    @guarded
     def learn(
         self: SelfCGP,
         total_timesteps: int,
@@ -426,20 +440,23 @@ class CGP(GradientAlgorithm):
         :param reset_num_timesteps: whether or not to reset the current timestep number (used in logging)
         :param progress_bar: Display a progress bar using tqdm and rich.
         :return: the trained model
-        :raises ValueError: if a reward, an observation or a loss is NaN or infinite
+        :raises ValueError: if a reward, an observation or a loss is NaN or infinite, or of a wrong shape
+        :raises RuntimeError: if a worker of a ``SubprocVecEnv`` has died
         """
-        n_updates = self._n_updates
-        super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
+        try:
+            super().learn(
+                total_timesteps=total_timesteps,
+                callback=callback,
+                log_interval=log_interval,
+                tb_log_name=tb_log_name,
+                reset_num_timesteps=reset_num_timesteps,
+                progress_bar=progress_bar,
+            )
+        finally:
+            self._release_signals()
         self._loss_watch.check()
         # Without a gradient step of the critics, there is nothing new for the policy to learn
-        if self.policy_training == "offline" and self._n_updates > n_updates:
+        if self._policy_is_due:
             self.train_policy(callback=callback, progress_bar=progress_bar)
         return self
 
@@ -498,13 +515,17 @@ class CGP(GradientAlgorithm):
         # Callbacks score and save the actor that is being trained
         is_trained, self._policy_is_trained = self._policy_is_trained, True
         self._choose_inference()
+        self.is_training_policy = True
         try:
             callback = self._init_callback(callback)
             n_steps, is_enough = descend_to_plateau(step, after_round, callback, max_steps, self.n_envs, progress_bar)
             is_trained = is_trained or is_enough
+            self._policy_is_due = False
         finally:
             self._policy_is_trained = is_trained
             self._choose_inference()
+            self.is_training_policy = False
+            self._release_signals()
         if self.verbose >= 1:
             print(f"The policy was trained for {n_steps} gradient steps")
         return self
@@ -542,7 +563,7 @@ class CGP(GradientAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "actor_target", "critic", "critic_target"]
-        return [*super()._excluded_save_params(), *aliases, "_actor_lr_schedule"]
+        return [*super()._excluded_save_params(), *aliases, "_actor_lr_schedule", "_bounds_watch"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts = ["policy", "actor.optimizer", "critic.optimizer"]

@@ -3,9 +3,7 @@
 import hashlib
 import json
 import logging
-import os
 import warnings
-from collections.abc import Mapping
 from copy import deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,6 +30,7 @@ from sb3_cgp.exported import (
     describe_box,
     optional,
 )
+from sb3_cgp.files import replace_all
 from sb3_cgp.validation import require
 
 if TYPE_CHECKING:
@@ -64,7 +63,7 @@ def export_policy(model: "CGP", folder: str | Path) -> None:
     contents = {TENSORS_FILE: safetensors_torch.save(tensors), ONNX_FILE: _checked_onnx(policy, observations, expected)}
     description["sha256"] = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
     contents[DESCRIPTION_FILE] = (json.dumps(description, indent=2, allow_nan=False) + "\n").encode()
-    _replace_all(Path(folder), contents)
+    replace_all(Path(folder), contents)
 
 
 def _normalizer(model: "CGP") -> VecNormalize | None:
@@ -215,32 +214,3 @@ def _checked_onnx(policy: ExportedPolicy, observations: np.ndarray, expected: np
     actions = session.run(["action"], {"observation": observations})[0]
     _check_same(ONNX_FILE, actions, expected, policy.action_space)
     return content
-
-
-def _replace_all(folder: Path, contents: Mapping[str, bytes]) -> None:
-    """
-    Write files so that whoever looks sees, of each of them, the old one or the new one, never a part.
-
-    All are on the disk before the first takes its place. The last one holds the others' checksums, so that what a crash
-    among the renamings leaves is recognised as a mix.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    beside = {name: folder / f".{name}.{os.getpid()}" for name in contents}
-    try:
-        for name, content in contents.items():
-            with open(beside[name], "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-        for name in contents:
-            os.replace(beside[name], folder / name)
-    finally:
-        for path in beside.values():
-            path.unlink(missing_ok=True)
-    # Windows opens no folders, nor does it need to
-    if os.name == "posix":
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

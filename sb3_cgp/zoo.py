@@ -1,4 +1,4 @@
-"""CGP in rl_zoo3: the algorithm, its default hyperparameters, and Optuna's search space with its converter.
+"""CGP in rl_zoo3: the algorithm, its default hyperparameters, checkpoints, and Optuna's search space with its converter.
 
 An installed sb3_cgp does all this by itself as soon as rl_zoo3 is imported (``_sb3_cgp_zoo.py``); :func:`register` is for
 whoever runs without that, from a source tree or with ``python -S``, say. rl_zoo3 is imported inside the functions:
@@ -8,15 +8,21 @@ the hook calls them while rl_zoo3 is still being imported.
 import functools
 import importlib
 import inspect
+import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from sb3_cgp.callbacks import TrainingCheckpointCallback
 from sb3_cgp.cgp import CGP
+from sb3_cgp.environments import RestorableEnv
 
 if TYPE_CHECKING:
+    import gymnasium as gym
     import optuna
 
 ALGO = "cgp"
@@ -74,7 +80,10 @@ def register_search_space() -> None:
 
 
 def register_default_config() -> None:
-    """Have rl_zoo3 read our ``cgp.yml`` where no ``--conf-file`` is given: it looks inside its own package only."""
+    """
+    Have rl_zoo3 read our ``cgp.yml`` where no ``--conf-file`` is given, as it looks inside its own package only, and save
+    training states in the run's folder.
+    """
     from rl_zoo3.exp_manager import ExperimentManager
 
     initialise = ExperimentManager.__init__
@@ -91,6 +100,47 @@ def register_default_config() -> None:
 
     __init__.reads_cgp_yml = True  # type: ignore[attr-defined]
     ExperimentManager.__init__ = __init__  # type: ignore[method-assign]
+
+    create_callbacks = ExperimentManager.create_callbacks
+
+    @functools.wraps(create_callbacks)
+    def create_callbacks_with_folder(self: Any) -> None:
+        # Optuna's trials make callbacks of their own, which save nothing
+        if self.algo == ALGO and not self.optimize_hyperparameters:
+            prepare_checkpoints(self)
+        create_callbacks(self)
+        # rl_zoo3 ends the first of them itself after an error, to take a progress bar away
+        self.callbacks.sort(key=lambda callback: isinstance(callback, TrainingCheckpointCallback))
+
+    ExperimentManager.create_callbacks = create_callbacks_with_folder  # type: ignore[method-assign]
+
+
+def state_folder(save_path: str) -> str:
+    """
+    Tell where a run's training states lie.
+
+    :param save_path: the run's folder
+    :return: the folder of the states
+    """
+    return os.path.join(save_path, "state")
+
+
+def prepare_checkpoints(experiment: Any) -> None:
+    """
+    Let a run's checkpoint callbacks save into the run's folder, and its environments be restored.
+
+    :param experiment: rl_zoo3's manager of the run, its specified callbacks made and its environments not yet
+    """
+    checkpoints = [each for each in experiment.callbacks if isinstance(each, TrainingCheckpointCallback)]
+    for each in checkpoints:
+        if each.path is None:
+            each.path = state_folder(experiment.save_path)
+    if checkpoints and issubclass(experiment.vec_env_class, SubprocVecEnv):
+        experiment.env_wrapper = functools.partial(_make_restorable, experiment.env_wrapper)
+
+
+def _make_restorable(env_wrapper: "Callable[[gym.Env], gym.Env] | None", env: "gym.Env") -> RestorableEnv:
+    return RestorableEnv(env if env_wrapper is None else env_wrapper(env))
 
 
 def hyperparams_folder() -> Path:

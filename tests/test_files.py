@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmark.files import markdown_table, write_atomically
+from benchmark.files import markdown_table
+from sb3_cgp.files import write_atomically
 
 
 def test_markdown_table_lines_up():

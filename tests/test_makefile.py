@@ -109,6 +109,22 @@ def test_failed_training_is_not_reported(clone: Clone) -> None:
     assert not starting(calls, "-m benchmark.report")
 
 
+def test_resume_goes_on_with_the_named_run_and_reports_it(clone: Clone) -> None:
+    calls, ended = clone.make("resume", "RUN=my logs/cgp/Ant-v5_2")
+    assert ended.returncode == 0, ended.stderr
+    assert calls[-2:] == ["-m sb3_cgp.resume <my logs/cgp/Ant-v5_2>", "-m benchmark.report --run <my logs/cgp/Ant-v5_2>"]
+    calls, ended = clone.make("resume", "RUN=logs/cgp/Ant-v5_2", FAIL="sb3_cgp.resume")
+    assert ended.returncode != 0
+    assert not starting(calls, "-m benchmark.report")
+
+
+def test_resume_without_a_run_says_how_to_name_one(clone: Clone) -> None:
+    calls, ended = clone.make("resume", RUN="/var/run")
+    assert ended.returncode != 0
+    assert "make resume RUN=logs/cgp/Pendulum-v1_1" in ended.stderr
+    assert not starting(calls, "-m sb3_cgp")
+
+
 @pytest.mark.parametrize("goal", ["train", "test"])
 def test_nothing_is_installed_twice(clone: Clone, goal: str) -> None:
     clone.make(goal)
@@ -158,7 +174,7 @@ def test_old_python_is_refused_by_name(clone: Clone) -> None:
 def test_help_is_the_default_and_lists_every_goal(clone: Clone) -> None:
     calls, ended = clone.make()
     assert not calls
-    for goal in ("train", "test", "test-slow", "lint", "format", "clean"):
+    for goal in ("train", "resume", "test", "test-slow", "lint", "format", "clean"):
         assert f"make {goal} " in ended.stdout
 
 

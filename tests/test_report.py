@@ -143,6 +143,19 @@ def test_latest_run_is_the_default(logs: Path) -> None:
     assert report.find_run(str(logs), "td3", ENV).folder == logs / "td3" / f"{ENV}_2"
 
 
+def test_a_run_is_found_by_its_folder_too(logs: Path) -> None:
+    assert report.run_in(logs / "td3" / f"{ENV}_1") == report.find_run(str(logs), "td3", ENV, 1)
+
+
+def test_a_folder_without_a_run_or_a_model_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=f"Error: {tmp_path} is no folder of a run"):
+        report.main(["--run", str(tmp_path)])
+    (tmp_path / ENV).mkdir()
+    (tmp_path / ENV / "args.yml").touch()
+    with pytest.raises(SystemExit, match=f"Error: No trained model in {tmp_path}"):
+        report.main(["--run", str(tmp_path)])
+
+
 def test_missing_run_names_the_folder_and_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match=r"No run of cgp on Pendulum-v1 in .*cgp: .*`make train ALGO=cgp") as error:
         report.main(["--folder", str(tmp_path)])

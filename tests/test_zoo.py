@@ -19,6 +19,7 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
 
 from sb3_cgp import CGP, zoo
+from sb3_cgp.callbacks import TrainingCheckpointCallback
 
 PAPER_TASKS = {f"{task}-v{version}" for task in ("HalfCheetah", "Humanoid", "Hopper", "Pusher", "Ant") for version in (4, 5)}
 OTHER_TASKS = {"Pendulum-v1", "MountainCarContinuous-v0"} | {
@@ -52,7 +53,8 @@ def unregistered(monkeypatch):
     zoo.register()
     for registry in (utils.ALGOS, hyperparams_opt.HYPERPARAMS_SAMPLER, hyperparams_opt.HYPERPARAMS_CONVERTER):
         monkeypatch.delitem(registry, "cgp")
-    monkeypatch.setattr(ExperimentManager, "__init__", ExperimentManager.__init__.__wrapped__)
+    for name in ("__init__", "create_callbacks"):
+        monkeypatch.setattr(ExperimentManager, name, getattr(ExperimentManager, name).__wrapped__)
 
 
 def test_register_adds_cgp_and_nothing_else(unregistered, tmp_path):
@@ -121,6 +123,7 @@ def test_the_default_entry_is_the_default_of_cgp():
     assert entry.pop("n_timesteps") == 1e6
     assert entry.pop("policy") == "MlpPolicy"
     assert entry.pop("policy_kwargs") == "dict(net_arch=[256, 256])"
+    assert entry.pop("callback") == [{"sb3_cgp.callbacks.TrainingCheckpointCallback": {"save_freq": 10_000}}]
     assert CGP("MlpPolicy", "Pendulum-v1", buffer_size=1).policy.net_arch == [256, 256]
     defaults = {name: parameter.default for name, parameter in inspect.signature(CGP).parameters.items()}
     assert entry == {name: defaults[name] for name in entry}
@@ -143,6 +146,44 @@ def test_every_entry_builds_a_model(env_id, tmp_path):
     assert model.gamma == ENTRIES[env_id]["gamma"]
     assert model.policy.net_arch == eval(ENTRIES[env_id]["policy_kwargs"])["net_arch"]
     assert (model.action_noise is not None) == ("noise_type" in saved)
+
+
+def checkpoints_of(experiment):
+    return [callback for callback in experiment.callbacks if isinstance(callback, TrainingCheckpointCallback)]
+
+
+def test_every_run_saves_states_in_its_folder_several_times(tmp_path):
+    zoo.register()
+    for entry in ENTRIES.values():
+        ((settings,),) = [each.values() for each in entry["callback"]]
+        assert settings["save_freq"] <= entry["n_timesteps"] / 10
+    experiment = manager(tmp_path, hyperparams=TINY, show_progress=True)
+    experiment.setup_experiment()
+    (checkpoint,) = checkpoints_of(experiment)
+    assert checkpoint.path == f"{tmp_path}/cgp/Pendulum-v1_1/state"
+    # rl_zoo3 takes the first for the progress bar
+    assert experiment.callbacks.index(checkpoint) == len(experiment.callbacks) - 1
+
+
+def test_a_folder_that_the_user_chose_is_kept_and_none_is_given_without_a_callback(tmp_path):
+    zoo.register()
+    callback = [{"sb3_cgp.callbacks.TrainingCheckpointCallback": {"save_freq": 10, "path": "mine"}}]
+    experiment = manager(tmp_path, hyperparams=TINY | {"callback": callback})
+    experiment.setup_experiment()
+    assert [each.path for each in checkpoints_of(experiment)] == ["mine"]
+    experiment = manager(tmp_path, hyperparams=TINY | {"callback": None})
+    experiment.setup_experiment()
+    assert experiment.callbacks == []
+
+
+def test_trials_of_optuna_save_no_states(tmp_path):
+    zoo.register()
+    small = TINY | {"learning_starts": 10}
+    options = dict(optimize_hyperparameters=True, n_trials=1, n_timesteps=20, n_evaluations=1, n_eval_episodes=1)
+    experiment = manager(tmp_path, hyperparams=small, no_optim_plots=True, **options)
+    assert experiment.setup_experiment() is None
+    experiment.hyperparameters_optimization()
+    assert [path for path in tmp_path.rglob("*") if path.name == "state"] == []
 
 
 @pytest.mark.parametrize("n_actions", [1, 6])

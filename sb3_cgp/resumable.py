@@ -1,0 +1,106 @@
+"""Algorithms whose training can be stopped anywhere, by whatever, and go on as if it had not been."""
+
+import copy
+import io
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+
+from sb3_cgp.callbacks import TrainingCheckpointCallback
+from sb3_cgp.checkpoint import State, begin_new_episode, fill_replay_buffer, walk
+from sb3_cgp.gradient import GradientAlgorithm
+from sb3_cgp.store import StateStore
+from sb3_cgp.validation import require
+
+SelfResumableAlgorithm = TypeVar("SelfResumableAlgorithm", bound="ResumableAlgorithm")
+
+
+class ResumableAlgorithm(GradientAlgorithm):
+    """An algorithm that goes on from the states that a :class:`~sb3_cgp.callbacks.TrainingCheckpointCallback` saves."""
+
+    # The training's callbacks
+    callback: BaseCallback
+    # What is to be restored when the training goes on
+    resumption: State | None = None
+    # The folder that this training's states are in
+    saved_to: Path | None = None
+    # Environment steps when the training started that is going on, or was interrupted
+    _training_started_at: int = 0
+    # Whether the critics have learnt since the policy was last trained offline
+    _policy_is_due: bool = False
+    # Whether this is the policy's offline training
+    is_training_policy: bool = False
+
+    @classmethod
+    def resume(
+        cls: type[SelfResumableAlgorithm],
+        path: str | Path,
+        env: GymEnv,
+        device: th.device | str = "auto",
+        **kwargs: Any,
+    ) -> SelfResumableAlgorithm:
+        """
+        Load the newest undamaged state of a training that was interrupted.
+
+        The model's next ``learn`` goes on with that training: give it the arguments that it had at first. Its
+        ``total_timesteps`` means what it meant, so that the training ends where it would have ended. Without a
+        :class:`~sb3_cgp.callbacks.TrainingCheckpointCallback` among its callbacks, states go on being saved as before.
+
+        The state holds SB3's zip, which is unpickled and can run code, as with :meth:`load`: resume your own trainings only.
+
+        :param path: the folder of the states
+        :param env: the environment, made as at first; its state is restored when ``learn`` starts
+        :param device: Device on which the code should run.
+        :param kwargs: arguments to change in the model, see :meth:`load`
+        :return: the model
+        :raises FileNotFoundError: if the folder holds no state
+        :raises ValueError: if all states are damaged, naming the files, or if the environment or an argument does not fit
+        """
+        _, state = StateStore(path).load()
+        require(state["algorithm"] == cls.__name__, "path", str(path), f"of {cls.__name__}, not {state['algorithm']}")
+        model = cls.load(io.BytesIO(state.pop("model")), env, device, force_reset=False, **kwargs)
+        require(model.n_envs == state["n_envs"], "env.num_envs", model.n_envs, f"{state['n_envs']}, as was saved")
+        fill_replay_buffer(model._ensure_replay_buffer(), state.pop("replay_buffer"))
+        model.resumption = state | {"checkpoint": state["checkpoint"] | {"path": path}}
+        return model
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        *args: Any,
+        **kwargs: Any,
+    ) -> tuple[int, BaseCallback]:
+        if self.resumption is None:
+            result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
+            self._training_started_at = self._num_timesteps_at_start
+            return result
+        if self.resumption["environment"] is None:
+            begin_new_episode(self, self.resumption)
+        # SB3 resets it
+        action_noise = copy.deepcopy(self.action_noise)
+        steps_left = self._training_started_at + total_timesteps - self.num_timesteps
+        result = super()._setup_learn(steps_left, callback, False, *args, **kwargs)
+        self.action_noise = action_noise
+        return result
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        callback = super()._init_callback(callback, progress_bar)
+        if self.resumption is not None and not any(isinstance(each, TrainingCheckpointCallback) for each in walk(callback)):
+            callback = CallbackList([callback, TrainingCheckpointCallback(**self.resumption["checkpoint"])])
+            callback.init_callback(self)
+        self.callback = callback
+        return callback
+
+    def _release_signals(self) -> None:
+        """Let signals act as they did before the training, however it has ended."""
+        for each in walk(self.callback) if hasattr(self, "callback") else ():
+            if isinstance(each, TrainingCheckpointCallback):
+                each.release()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "callback", "resumption", "saved_to", "is_training_policy"]

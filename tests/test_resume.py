@@ -1,0 +1,331 @@
+"""Resumed trainings against straight ones: the same to the bit, wherever they were stopped."""
+
+import os
+import signal
+import subprocess
+import sys
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from trainings import SMALL, Interruption, Stop, Training, assert_same, fingerprint
+
+from sb3_cgp import CGP
+from sb3_cgp.callbacks import TrainingCheckpointCallback
+
+
+class Reach(gym.Env):
+    """Move to a goal on a line; it takes part in the protocol for environments of one's own."""
+
+    place, goal, steps = 0.0, 0.0, 0
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    observation_space = spaces.Dict(
+        {key: spaces.Box(-9, 9, (1,), np.float32) for key in ("observation", "achieved_goal", "desired_goal")}
+    )
+
+    def observe(self):
+        place = np.array([self.place], np.float32)
+        return {"observation": place, "achieved_goal": place, "desired_goal": np.array([self.goal], np.float32)}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.goal, self.steps = 0.0, float(self.np_random.uniform(-2, 2)), 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.place, self.steps = float(np.clip(self.place + action[0], -9, 9)), self.steps + 1
+        observation = self.observe()
+        reward = float(self.compute_reward(observation["achieved_goal"], observation["desired_goal"], {})[0])
+        return observation, reward, bool(reward == 0.0), self.steps >= 12, {}
+
+    def compute_reward(self, achieved, desired, info):
+        return -(np.abs(achieved - desired) > 0.3).astype(np.float32).reshape(len(np.atleast_2d(achieved)))
+
+    def get_training_state(self):
+        return {"place": self.place, "goal": self.goal, "steps": self.steps, "random": self.np_random.bit_generator.state}
+
+    def set_training_state(self, state):
+        self.place, self.goal, self.steps = state["place"], state["goal"], state["steps"]
+        self.np_random.bit_generator.state = state["random"]
+
+
+class Opaque(gym.Wrapper):
+    """A wrapper of somebody's own, which may do anything."""
+
+
+UNHURRIED = settings(
+    deadline=None,
+    derandomize=True,
+    phases=[Phase.generate],
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+GAUSSIAN = NormalActionNoise(np.zeros(1), 0.1 * np.ones(1))
+NOISE = OrnsteinUhlenbeckActionNoise(np.zeros(1), 0.2 * np.ones(1))
+CASES = {
+    "CGP-Online": dict(),
+    "QGP-Online": dict(policy_loss="qgp"),
+    "CEM": dict(policy_loss=None),
+    "CGP-Offline": dict(policy_training="offline"),
+    "QGP-Offline": dict(policy_loss="qgp", policy_training="offline"),
+    "averaged actor, delays": dict(inference="averaged_actor", policy_delay=3, target_update_interval=4),
+    "n-step": dict(n_steps=3),
+    "VecNormalize": dict(normalises=True),
+    "environments": dict(n_envs=3, train_freq=2, gradient_steps=-1),
+    "environments, normalised, noise": dict(n_envs=2, normalises=True, action_noise=GAUSSIAN),
+    "Ornstein-Uhlenbeck": dict(action_noise=NOISE),
+    "schedules": dict(learning_rate="lin_1e-3", actor_learning_rate="lin_1e-2"),
+    "episodes": dict(env="InvertedPendulum-v5", train_freq=(1, "episode"), gradient_steps=-1, save_freq=1),
+    "MuJoCo": dict(env="Reacher-v5", normalises=True, n_steps=2),
+    "lean": dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)),
+    "dictionaries": dict(env=Reach, policy="MultiInputPolicy"),
+    "hindsight": dict(env=Reach, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer, n_envs=2, save_freq=14),
+}
+
+
+@pytest.fixture(autouse=True)
+def short_policy_training(monkeypatch):
+    monkeypatch.setattr("sb3_cgp.offline.ROUND", 10)
+
+
+def straight(folder, case):
+    training = Training(folder / "straight", **CASES[case])
+    return training, fingerprint(training, training.run())
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_resumed_training_is_straight_training(tmp_path, case):
+    training, expected = straight(tmp_path, case)
+    resumed = Training(tmp_path / "resumed", **CASES[case])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # SB3's, whenever a model with an n-step buffer is loaded
+        warnings.filterwarnings("ignore", message="`n_steps=")
+        assert_same(fingerprint(resumed, resumed.run(47, 83, 118)), expected)
+    for step, line in training.written.lines.items():
+        assert resumed.written.lines[step] == pytest.approx(line, rel=0, abs=0, nan_ok=True)
+
+
+def any_stops(test):
+    """Hand a test any training, stopped anywhere; a failing one is not made smaller, which would take minutes."""
+    stops = st.lists(st.integers(42, 125), min_size=1, max_size=4)
+    return given(case=st.sampled_from(list(CASES)), stops=stops, save_freq=st.integers(1, 10))(test)
+
+
+def stopped_anywhere(folder, case, stops, save_freq):
+    _, expected = straight(folder, case)
+    resumed = Training(folder / "resumed", **(CASES[case] | dict(save_freq=save_freq)))
+    assert_same(fingerprint(resumed, resumed.run(*stops)), expected)
+
+
+@settings(UNHURRIED, max_examples=5)
+@any_stops
+def test_wherever_it_was_stopped(tmp_path_factory, case, stops, save_freq):
+    stopped_anywhere(tmp_path_factory.mktemp("training"), case, stops, save_freq)
+
+
+@pytest.mark.slow
+@settings(UNHURRIED, max_examples=40)
+@any_stops
+def test_wherever_it_was_stopped_more_often(tmp_path_factory, case, stops, save_freq):
+    stopped_anywhere(tmp_path_factory.mktemp("training"), case, stops, save_freq)
+
+
+def interrupted(folder, stop=47, **case):
+    """Train until the stop."""
+    training = Training(folder, **case)
+    with pytest.raises(Interruption):
+        training.learn(training.make_model(), stop)
+    return training
+
+
+def parameters(model):
+    return th.cat([parameter.detach().flatten() for parameter in model.policy.parameters()])
+
+
+def test_without_callbacks_states_go_on_being_saved(tmp_path):
+    interrupted(tmp_path)
+    model = CGP.resume(tmp_path / "state", make_vec_env("Pendulum-v1"))
+    assert model.num_timesteps == 40
+    model.learn(75)
+    assert model.num_timesteps == 75
+    resumed = CGP.resume(tmp_path / "state", make_vec_env("Pendulum-v1"))
+    assert resumed.num_timesteps == 75
+    assert th.equal(parameters(resumed), parameters(model))
+    # A finished training has nothing to do, and can be made longer
+    assert th.equal(parameters(resumed.learn(75)), parameters(model))
+    longer = CGP.resume(tmp_path / "state", make_vec_env("Pendulum-v1")).learn(90)
+    assert (longer.num_timesteps, longer._n_updates) == (90, 70)
+
+
+def test_second_trainings_go_on_to_their_own_end(tmp_path):
+    def train(folder, stop):
+        model = CGP("MlpPolicy", make_vec_env("Pendulum-v1", seed=1), policy_kwargs=dict(net_arch=[8]), **SMALL)
+        checkpoint = TrainingCheckpointCallback(10, folder)
+        model.learn(50, callback=checkpoint)
+        with pytest.raises(Interruption) if stop else warnings.catch_warnings():
+            model.learn(60, callback=[checkpoint, Stop(stop)], reset_num_timesteps=False)
+        return model
+
+    expected = train(tmp_path / "straight", None)
+    train(tmp_path / "state", 73)
+    model = CGP.resume(tmp_path / "state", make_vec_env("Pendulum-v1")).learn(60, reset_num_timesteps=False)
+    assert model.num_timesteps == expected.num_timesteps == 110
+    assert th.equal(parameters(model), parameters(expected))
+
+
+def test_the_states_of_another_training_are_not_overwritten(tmp_path):
+    interrupted(tmp_path)
+    before = sorted((tmp_path / "state").rglob("*"))
+    with pytest.raises(ValueError, match=r"`path` is '.*state', but must be a folder without the states of another training"):
+        Training(tmp_path).run()
+    assert sorted((tmp_path / "state").rglob("*")) == before
+
+
+def test_a_training_that_ended_in_the_middle_of_a_step_leaves_the_last_whole_one(tmp_path):
+    training = Training(tmp_path, save_freq=10)
+    stop = CheckpointCallback(1, str(tmp_path))
+    stop._on_step = lambda: stop.num_timesteps < 47
+    training.make_model().learn(90, callback=[TrainingCheckpointCallback(10, tmp_path / "state"), stop])
+    assert CGP.resume(tmp_path / "state", training.make_env(1)).num_timesteps == 40
+
+
+def test_an_environment_that_cannot_be_restored_begins_an_episode(tmp_path):
+    case = dict(env=lambda: Opaque(Reach()), policy="MultiInputPolicy", normalises=False)
+    training = interrupted(tmp_path, **case)
+    model = CGP.resume(tmp_path / "state", training.make_env(5))
+    assert model.num_timesteps == 40
+    with pytest.warns(UserWarning, match=r"The environment's state was not saved: .* The training goes on at an episode"):
+        training.learn(model, None)
+    assert (model.num_timesteps, model._n_updates) == (120, 100)
+
+
+@pytest.mark.parametrize("case", ["n-step", "lean", "hindsight"])
+def test_no_return_crosses_the_gap_where_an_environment_was_not_restored(tmp_path, case):
+    training = Training(tmp_path, **CASES[case])
+    training.env = lambda: Opaque(Reach() if case == "hindsight" else gym.make("Pendulum-v1"))
+    model = training.make_model()
+    with pytest.raises(Interruption):
+        training.learn(model, 47)
+    model = CGP.resume(tmp_path / "state", training.make_env(5))
+    last = model.replay_buffer.pos - 1
+    assert not model.replay_buffer.dones[last].any()
+    with pytest.warns(UserWarning, match="The environment's state was not saved"):
+        training.learn(model, None)
+    assert model.replay_buffer.dones[last].all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (dict(save_freq=0), "`save_freq` is 0, but must be"),
+        (dict(save_freq=2.5), "`save_freq` is 2.5, but must be"),
+        (dict(save_freq=1, keep=0), "`keep` is 0, but must be"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        TrainingCheckpointCallback(**arguments)
+
+
+def test_without_a_path_nothing_happens(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    handler = signal.getsignal(signal.SIGTERM)
+    CGP("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[8]), **SMALL).learn(
+        40, callback=TrainingCheckpointCallback(10)
+    )
+    assert list(tmp_path.iterdir()) == []
+    assert signal.getsignal(signal.SIGTERM) is handler
+
+
+def test_what_does_not_fit_is_refused(tmp_path):
+    training = interrupted(tmp_path)
+    with pytest.raises(ValueError, match=r"`env.num_envs` is 3, but must be 1, as was saved"):
+        CGP.resume(tmp_path / "state", make_vec_env("Pendulum-v1", n_envs=3))
+    with pytest.raises(ValueError, match=r"`replay_buffer.observations` is .* but must be of a shape that .* fits into"):
+        CGP.resume(tmp_path / "state", training.make_env(1), buffer_size=20)
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        CGP.resume(tmp_path / "nowhere", training.make_env(1))
+
+
+def test_hindsight_with_the_environments_information_is_refused_before_it_trains(tmp_path):
+    arguments = SMALL | dict(replay_buffer_class=HerReplayBuffer, replay_buffer_kwargs=dict(copy_info_dict=True))
+    model = CGP("MultiInputPolicy", make_vec_env(Reach), **arguments)
+    with pytest.raises(ValueError, match="`copy_info_dict` is True, but must be False where the training is saved"):
+        model.learn(40, callback=TrainingCheckpointCallback(10, tmp_path))
+    assert model.num_timesteps == 0
+
+
+def test_callbacks_that_are_gone_are_named(tmp_path):
+    class Counting(Stop):
+        counted = 0
+
+    training = Training(tmp_path)
+    model = CGP("MlpPolicy", training.make_env(1), policy_kwargs=dict(net_arch=[8]), **SMALL)
+    callbacks = CallbackList([TrainingCheckpointCallback(10, tmp_path / "state"), Counting(47)])
+    with pytest.raises(Interruption):
+        model.learn(60, callback=callbacks)
+    model = CGP.resume(tmp_path / "state", training.make_env(1))
+    with pytest.warns(UserWarning, match="Counting was among the callbacks, and is not now: what it counted is lost"):
+        model.learn(60)
+
+
+def test_callbacks_keep_their_new_arguments_and_their_old_counters(tmp_path):
+    training = interrupted(tmp_path)
+    evaluation = EvalCallback(training.make_env(3), eval_freq=1_000, n_eval_episodes=1, verbose=0)
+    model = CGP.resume(tmp_path / "state", training.make_env(1))
+    model.learn(60, callback=[TrainingCheckpointCallback(10, tmp_path / "state"), evaluation])
+    assert (evaluation.eval_freq, evaluation.n_eval_episodes, evaluation.n_calls) == (1_000, 1, 60)
+    assert evaluation.best_mean_reward == max(map(np.mean, training.evaluation.evaluations_results))
+
+
+SCRIPT = """
+import sys, numpy as np
+from sb3_cgp import CGP
+from trainings import Training, fingerprint
+training = Training(sys.argv[1], normalises=True, steps=int(sys.argv[2]), save_freq=25)
+state = training.folder / "state"
+if list(state.glob("state-*.json")):
+    model = CGP.resume(state, training.make_env(7))
+else:
+    model = training.make_model()
+training.learn(model, None)
+np.savez(training.folder / "result", **fingerprint(training, model))
+"""
+
+
+def process(folder, steps):
+    environment = os.environ | {"PYTHONPATH": os.path.dirname(__file__), "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen([sys.executable, "-c", SCRIPT, str(folder), str(steps)], stdout=subprocess.PIPE, env=environment)
+
+
+def result(folder):
+    with np.load(folder / "result.npz") as found:
+        return dict(found)
+
+
+def wait_for_state(folder):
+    while not list((folder / "state").glob("state-*.json")):
+        pass
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_stopped_processes_go_on_in_new_ones(tmp_path, number):
+    steps = 600
+    straight = process(tmp_path / "straight", steps)
+    stopped = process(tmp_path / "stopped", steps)
+    wait_for_state(tmp_path / "stopped")
+    stopped.send_signal(number)
+    assert stopped.wait() == (143 if number == signal.SIGTERM else -9)
+    assert not (tmp_path / "stopped" / "result.npz").exists()
+    assert process(tmp_path / "stopped", steps).wait() == 0
+    assert straight.wait() == 0
+    assert_same(result(tmp_path / "stopped"), result(tmp_path / "straight"))
