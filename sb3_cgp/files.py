@@ -2,22 +2,49 @@
 
 import errno
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 # What files are called until they are whole
 PARTIAL = ".partial-"
 
 
-def write_atomically(path: Path, content: bytes | memoryview) -> None:
+@contextmanager
+def whole_file(path: Path) -> Iterator[BinaryIO]:
     """
     Write a file so that whoever looks sees the old one or the new one, never a part, and after a crash too.
 
-    :param path: the file
-    :param content: what it shall hold
+    :param path: the file; its folder is made if it is missing
+    :return: where to write, which takes its place at the end unless there was an error
     :raises OSError: if it cannot be written, as on a full disk; it names the file, and the old one is still there
     """
-    replace_all(path.parent, {path.name: content})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = _beside(path)
+    try:
+        with open(beside, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    except OSError as error:
+        raise _not_written(error, path) from error
+    finally:
+        beside.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def write_atomically(path: Path, content: bytes | memoryview) -> None:
+    """
+    Write a file as :func:`whole_file` does.
+
+    :param path: the file
+    :param content: what it shall hold
+    :raises OSError: if it cannot be written; it names the file, and the old one is still there
+    """
+    with whole_file(path) as file:
+        file.write(content)
 
 
 def replace_all(folder: Path, contents: Mapping[str, bytes | memoryview]) -> None:
@@ -32,7 +59,7 @@ def replace_all(folder: Path, contents: Mapping[str, bytes | memoryview]) -> Non
     :raises OSError: if one cannot be written; it names the file, and the old ones are still there
     """
     folder.mkdir(parents=True, exist_ok=True)
-    beside = {name: folder / f"{PARTIAL}{os.getpid()}-{name}" for name in contents}
+    beside = {name: _beside(folder / name) for name in contents}
     name = ""
     try:
         for name, content in contents.items():
@@ -43,12 +70,19 @@ def replace_all(folder: Path, contents: Mapping[str, bytes | memoryview]) -> Non
         for name, path in beside.items():
             os.replace(path, folder / name)
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise OSError(error.errno or errno.EIO, f"{reason}, so that this was not written", str(folder / name)) from error
+        raise _not_written(error, folder / name) from error
     finally:
         for path in beside.values():
             path.unlink(missing_ok=True)
     sync_folder(folder)
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
+
+
+def _not_written(error: OSError, path: Path) -> OSError:
+    return OSError(error.errno or errno.EIO, f"{error.strerror or error}, so that this was not written", str(path))
 
 
 def sync_folder(folder: Path) -> None:

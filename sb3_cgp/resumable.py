@@ -2,6 +2,8 @@
 
 import copy
 import io
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,11 +13,23 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_cgp.callbacks import TrainingCheckpointCallback
 from sb3_cgp.checkpoint import State, begin_new_episode, fill_replay_buffer, walk
+from sb3_cgp.files import whole_file
 from sb3_cgp.gradient import GradientAlgorithm
 from sb3_cgp.store import StateStore
 from sb3_cgp.validation import require
 
 SelfResumableAlgorithm = TypeVar("SelfResumableAlgorithm", bound="ResumableAlgorithm")
+
+
+@contextmanager
+def _whole(path: str | Path | io.BufferedIOBase, suffix: str) -> Iterator[Any]:
+    """Open a file to be written as a whole, named as SB3 names it; what is open already is left to whoever opened it."""
+    if isinstance(path, io.BufferedIOBase):
+        yield path
+        return
+    path = Path(path)
+    with whole_file(path if path.suffix else path.with_name(path.name + suffix)) as file:
+        yield file
 
 
 class ResumableAlgorithm(GradientAlgorithm):
@@ -66,6 +80,34 @@ class ResumableAlgorithm(GradientAlgorithm):
         fill_replay_buffer(model._ensure_replay_buffer(), state.pop("replay_buffer"))
         model.resumption = state | {"checkpoint": state["checkpoint"] | {"path": path}}
         return model
+
+    def save(
+        self,
+        path: str | Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save all the attributes of the object and the model parameters in a zip-file, which appears as a whole or not at all.
+
+        :param path: path to the file where the rl agent should be saved
+        :param exclude: name of parameters that should be excluded in addition to the default ones
+        :param include: name of parameters that might be excluded but should be included anyway
+        :raises OSError: if it cannot be written; a file that was there is as it was
+        """
+        with _whole(path, ".zip") as file:
+            super().save(file, exclude, include)
+
+    def save_replay_buffer(self, path: str | Path | io.BufferedIOBase) -> None:
+        """
+        Save the replay buffer as a pickle file, which appears as a whole or not at all.
+
+        :param path: Path to the file where the replay buffer should be saved.
+            if path is a str or pathlib.Path, the path is automatically created if necessary.
+        :raises OSError: if it cannot be written; a file that was there is as it was
+        """
+        with _whole(path, ".pkl") as file:
+            super().save_replay_buffer(file)
 
     def _setup_learn(
         self,

@@ -1,15 +1,43 @@
 """Writing results."""
 
+import errno
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmark.files import markdown_table
+from sb3_cgp import CGP
 from sb3_cgp.files import write_atomically
 
 
 def test_markdown_table_lines_up():
     assert markdown_table(["a", "b"], [["1", "2"], ["3", "4"]]) == "| a | b |\n| --- | ---: |\n| 1 | 2 |\n| 3 | 4 |"
+
+
+@pytest.mark.parametrize("name", ["save", "save_replay_buffer"])
+def test_models_and_buffers_are_saved_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    model = CGP("MlpPolicy", "Pendulum-v1", buffer_size=10, policy_kwargs=dict(net_arch=[4]))
+    save = getattr(model, name)
+    save(tmp_path / "new" / "saved")
+    (path,) = (tmp_path / "new").iterdir()
+    # As SB3 calls it
+    assert path.name == {"save": "saved.zip", "save_replay_buffer": "saved.pkl"}[name]
+    before = path.read_bytes()
+    model.replay_buffer.add(*[np.zeros((1, 3))] * 2, np.zeros((1, 1)), np.zeros(1), np.zeros(1), [{}])
+    model.num_timesteps = 7
+
+    def full_disk(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.fsync", full_disk)
+        with pytest.raises(OSError, match=f"No space left on device, so that this was not written: '.*{path.name}'"):
+            save(str(tmp_path / "new" / "saved"))
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+    save(path)
+    assert path.read_bytes() != before
 
 
 def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
