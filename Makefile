@@ -80,7 +80,7 @@ $(INSTALLED): $(REQUIREMENTS)
 	  echo "Name a newer one, as in: make PYTHON=python3.12 $(or $(MAKECMDGOALS),train)" >&2; exit 1; }
 	test -e $@ || $(PYTHON) -m venv --clear $(VENV)
 	rm -f $(INSTALLED) $(TESTS_INSTALLED)
-	$(IN_VENV) -m pip install -c constraints.txt -e .
+	$(IN_VENV) -m pip install -c constraints.txt -e ".[benchmark]"
 	touch $@
 
 $(TESTS_INSTALLED): $(INSTALLED)

@@ -26,7 +26,7 @@ from sb3_cgp.diagnostics import policy_diagnostics
 from sb3_cgp.export import export_policy
 from sb3_cgp.exported import ExportedPolicy, load_weights
 from sb3_cgp.faults import BoundsWatch, check_reward, check_shape, guarded
-from sb3_cgp.gradient import StepLosses
+from sb3_cgp.gradient import GradientAlgorithm, StepLosses
 from sb3_cgp.losses import bootstrap_target, cgp_loss, critic_loss, qgp_loss, smooth_target_actions
 from sb3_cgp.offline import descend_to_plateau
 from sb3_cgp.policies import CGPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
@@ -53,7 +53,7 @@ def _as_schedule(rate: float | Schedule | str) -> Schedule:
     return FloatSchedule(rate)
 
 
-class CGP(ResumableAlgorithm):
+class CGP(ResumableAlgorithm, GradientAlgorithm):
     """
     Cross-Entropy Guided Policies (CGP).
 
@@ -224,7 +224,7 @@ class CGP(ResumableAlgorithm):
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         # The first place that sees every environment's action space, before SB3's assertions, which name no value
-        env = ResumableAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        env = GradientAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         check_action_space(env.action_space)
         return env
 
@@ -443,17 +443,14 @@ class CGP(ResumableAlgorithm):
         :raises ValueError: if a reward, an observation or a loss is NaN or infinite, or of a wrong shape
         :raises RuntimeError: if a worker of a ``SubprocVecEnv`` has died
         """
-        try:
-            super().learn(
-                total_timesteps=total_timesteps,
-                callback=callback,
-                log_interval=log_interval,
-                tb_log_name=tb_log_name,
-                reset_num_timesteps=reset_num_timesteps,
-                progress_bar=progress_bar,
-            )
-        finally:
-            self._release_signals()
+        super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
         self._loss_watch.check()
         # Without a gradient step of the critics, there is nothing new for the policy to learn
         if self._policy_is_due:

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_cgp.callbacks import TrainingCheckpointCallback
 from sb3_cgp.checkpoint import State, begin_new_episode, fill_replay_buffer, walk
 from sb3_cgp.files import whole_file
-from sb3_cgp.gradient import GradientAlgorithm
 from sb3_cgp.store import StateStore
 from sb3_cgp.validation import require
 
@@ -32,8 +33,12 @@ def _whole(path: str | Path | io.BufferedIOBase, suffix: str) -> Iterator[Any]:
         yield file
 
 
-class ResumableAlgorithm(GradientAlgorithm):
-    """An algorithm that goes on from the states that a :class:`~sb3_cgp.callbacks.TrainingCheckpointCallback` saves."""
+class ResumableAlgorithm(OffPolicyAlgorithm):
+    """
+    An algorithm that goes on from the states that a :class:`~sb3_cgp.callbacks.TrainingCheckpointCallback` saves.
+
+    It comes first among an algorithm's bases: :func:`resumable` makes one of any of SB3's off-policy algorithms.
+    """
 
     # The training's callbacks
     callback: BaseCallback
@@ -138,6 +143,27 @@ class ResumableAlgorithm(GradientAlgorithm):
         self.callback = callback
         return callback
 
+    def _ensure_replay_buffer(self) -> ReplayBuffer:
+        """Find the replay buffer, which SB3's algorithms allocate when they are made or loaded."""
+        ensure = getattr(super(), "_ensure_replay_buffer", None)
+        if ensure is not None:
+            return ensure()
+        assert self.replay_buffer is not None
+        return self.replay_buffer
+
+    def learn(self: SelfResumableAlgorithm, *args: Any, **kwargs: Any) -> SelfResumableAlgorithm:
+        """
+        Learn as the algorithm does, or go on with that.
+
+        :param args: the algorithm's own arguments
+        :param kwargs: the algorithm's own arguments
+        :return: the trained model
+        """
+        try:
+            return super().learn(*args, **kwargs)
+        finally:
+            self._release_signals()
+
     def _release_signals(self) -> None:
         """Let signals act as they did before the training, however it has ended."""
         for each in walk(self.callback) if hasattr(self, "callback") else ():
@@ -146,3 +172,15 @@ class ResumableAlgorithm(GradientAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "callback", "resumption", "saved_to", "is_training_policy"]
+
+
+def resumable(algorithm: type[OffPolicyAlgorithm]) -> type[ResumableAlgorithm]:
+    """
+    Make an off-policy algorithm one whose training can be saved and resumed, and which is the same otherwise.
+
+    :param algorithm: the algorithm, such as SB3's TD3
+    :return: a subclass of its name
+    """
+    if issubclass(algorithm, ResumableAlgorithm):
+        return algorithm
+    return type(algorithm.__name__, (ResumableAlgorithm, algorithm), {"__doc__": algorithm.__doc__})

@@ -16,7 +16,7 @@ from typing import Any
 import torch as th
 import yaml
 from huggingface_sb3 import EnvironmentName
-from rl_zoo3 import exp_manager
+from rl_zoo3 import ALGOS, exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat, make_output_format
 from stable_baselines3.common.monitor import Monitor
@@ -24,9 +24,9 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 from torch.utils.tensorboard import SummaryWriter
 
-from sb3_cgp.cgp import CGP
 from sb3_cgp.environments import restore_environment
 from sb3_cgp.monitors import cut_monitors, read_start
+from sb3_cgp.resumable import ResumableAlgorithm, resumable
 from sb3_cgp.store import StateStore
 from sb3_cgp.zoo import ALGO, register, state_folder
 
@@ -103,8 +103,8 @@ class ResumedExperiment(ExperimentManager):
         finally:
             exp_manager.make_vec_env = make_vec_env
 
-    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> CGP:
-        model = CGP.resume(state_folder(self.save_path), env, device=self.device)
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> ResumableAlgorithm:
+        model = resumable(ALGOS[self.algo]).resume(state_folder(self.save_path), env, device=self.device)  # type: ignore[arg-type]
         assert model.resumption is not None
         print(f"Resuming {self.save_path} at step {model.num_timesteps}")
         self._continue_monitors(env, model.num_timesteps, model.resumption["environment"])
@@ -124,7 +124,7 @@ class ResumedExperiment(ExperimentManager):
             # Times in the file count from its header
             env.env_method("set_wrapper_attr", "t_start", read_start(path), indices=index)
 
-    def _continue_tensorboard(self, model: CGP, folder: str | None) -> None:
+    def _continue_tensorboard(self, model: ResumableAlgorithm, folder: str | None) -> None:
         """Write to the run's own events, of which TensorBoard hides those that came after the state was saved."""
         if self.tensorboard_log is None or folder is None:
             return

@@ -106,7 +106,7 @@ def register_default_config() -> None:
     @functools.wraps(create_callbacks)
     def create_callbacks_with_folder(self: Any) -> None:
         # Optuna's trials make callbacks of their own, which save nothing
-        if self.algo == ALGO and not self.optimize_hyperparameters:
+        if not self.optimize_hyperparameters:
             prepare_checkpoints(self)
         create_callbacks(self)
         # rl_zoo3 ends the first of them itself after an error, to take a progress bar away

@@ -1,0 +1,93 @@
+"""Opening Optuna's storages for many processes at once, and being patient with a database that is away for a while."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import urlsplit
+
+import grpc
+import optuna
+from optuna.storages import BaseStorage, GrpcStorageProxy, RDBStorage, get_storage
+from sqlalchemy import create_engine, event
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+
+Result = TypeVar("Result")
+
+# What says that the database, and not the call, is at fault. Optuna lets some of SQLAlchemy's errors through.
+STORAGE_ERRORS = (optuna.exceptions.StorageInternalError, SQLAlchemyError, grpc.RpcError, ConnectionError)
+# Seconds that SQLite waits for another process's writing
+SQLITE_TIMEOUT = 120
+
+
+def open_storage(url: str) -> BaseStorage:
+    """
+    Open a storage, and make it if it is a file of SQLite that is missing.
+
+    :param url: SQLAlchemy's URL of a database, or ``grpc://host:port`` of Optuna's proxy in front of one
+    :return: the storage
+    :raises ValueError: if it is neither, or the database's driver is not installed
+    """
+    parts = urlsplit(url)
+    if parts.scheme == "grpc":
+        if parts.hostname is None or parts.port is None:
+            raise ValueError(
+                f"The value of `storage` is {url!r}, but must have a host and a port, as in grpc://localhost:13000"
+            )
+        return GrpcStorageProxy(host=parts.hostname, port=parts.port)
+    try:
+        database = make_url(url)
+        # The driver of the database
+        create_engine(database)
+    except (ArgumentError, ImportError) as error:
+        raise ValueError(f"The value of `storage` is {url!r}, but must be a database's URL: {error}") from error
+    if database.get_backend_name() != "sqlite":
+        return get_storage(RDBStorage(url, engine_kwargs={"pool_pre_ping": True}))
+    if database.database:
+        Path(database.database).parent.mkdir(parents=True, exist_ok=True)
+    storage = RDBStorage(url, engine_kwargs={"connect_args": {"timeout": SQLITE_TIMEOUT}})
+    _make_transactions_exclusive(storage)
+    return get_storage(storage)
+
+
+def _make_transactions_exclusive(storage: RDBStorage) -> None:
+    """
+    Let a transaction of SQLite's hold the database from its start, as SQLAlchemy's documentation does it.
+
+    Otherwise two processes may both read that a trial waits before either writes that it takes it.
+    """
+
+    @event.listens_for(storage.engine, "connect")
+    def leave_transactions_to_us(connection: Any, record: Any) -> None:
+        connection.isolation_level = None
+
+    @event.listens_for(storage.engine, "begin")
+    def begin(connection: Any) -> None:
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+
+    # Connections from before
+    storage.engine.dispose()
+
+
+def patiently(call: Callable[..., Result], *args: Any, patience: float = 300.0, **kwargs: Any) -> Result:
+    """
+    Ask a storage again and again while its database does not answer.
+
+    A call that has taken effect although its answer was lost is made twice: let it be one for which that does no harm.
+
+    :param call: a method of the storage
+    :param args: its arguments
+    :param patience: seconds until its error is taken for an answer
+    :param kwargs: its arguments
+    :return: what it returns
+    """
+    start, pause = time.monotonic(), 0.1
+    while True:
+        try:
+            return call(*args, **kwargs)
+        except STORAGE_ERRORS:
+            if time.monotonic() - start + pause > patience:
+                raise
+            time.sleep(pause)
+            pause = min(2 * pause, 5.0)

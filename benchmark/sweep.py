@@ -1,0 +1,256 @@
+"""
+Runs a sweep, or goes on with it: ``python -m benchmark.sweep e3 --task Pendulum-v1 --steps 3000 --seeds 2 --workers 2``.
+
+The runs are trials of an Optuna study. The same command, given again after whatever interruption, or on other machines with
+the same ``--storage``, takes up what is not finished. At the end it exports the runs and draws the figures.
+"""
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch as th
+import yaml
+
+from benchmark.arguments import count, output_folder
+from benchmark.experiments import Sweep, SweepError, included_sweeps, load_sweep
+from benchmark.exports import export_study
+from benchmark.progress import Tally, display
+from benchmark.provenance import conditions
+from benchmark.storages import open_storage
+from benchmark.studies import Ledger
+from benchmark.worker import BEAT, GRACE
+
+DEFAULT_STORAGE = "sqlite:///logs/sweeps/studies.db"
+# Seconds between two looks at the study
+LOOK = 2.0
+
+
+def describe(sweep: Sweep, argv: Sequence[str], device: str) -> dict[str, Any]:
+    """
+    Say what a sweep is, for the study and for the page on it.
+
+    :param sweep: the sweep
+    :param argv: the command line
+    :param device: where the networks compute
+    :return: plain data
+    """
+    file = sweep.file
+    return {
+        "title": file.title,
+        "experiment": sweep.name,
+        "axes": {name: list(axis.values) for name, axis in file.axes.items()},
+        "methods": list(sweep.methods),
+        "tasks": file.tasks,
+        "seeds": sweep.seeds,
+        "steps": file.steps,
+        "evaluation_interval": file.evaluation_interval,
+        "evaluation_episodes": file.evaluation_episodes,
+        "settings_in_words": "; ".join(sweep.changes),
+        "runs_planned": len(sweep.runs()),
+        **conditions("benchmark.sweep", argv, th.device("cpu") if device == "auto" else th.device(device)),
+    }
+
+
+def start_workers(args: argparse.Namespace, study: str) -> list[subprocess.Popen[bytes]]:
+    """
+    Start the processes that train.
+
+    :param args: the command line
+    :param study: the study's name
+    :return: the processes
+    """
+    threads = args.threads or max((os.cpu_count() or 1) // args.workers, 1)
+    command = [sys.executable, "-m", "benchmark.worker", "--study", study, "--storage", args.storage]
+    command += ["--logs", str(args.logs), "--threads", str(threads), "--device", args.device, "--parent", str(os.getpid())]
+    command += ["--beat", str(args.beat), "--grace", str(args.grace)]
+    folder = args.logs / study
+    folder.mkdir(parents=True, exist_ok=True)
+    # A library's threads are counted when it is loaded
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
+    workers = []
+    for number in range(args.workers):
+        with open(folder / f"worker-{number}.log", "ab") as log:
+            workers.append(subprocess.Popen(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, env=environment))
+    return workers
+
+
+def run(sweep: Sweep, study: str, args: argparse.Namespace, argv: Sequence[str]) -> Path:
+    """
+    Work a sweep off, by processes of this machine and whoever else shares the storage.
+
+    :param sweep: the sweep
+    :param study: the study's name
+    :param args: the command line
+    :param argv: its arguments
+    :return: the folder of the results
+    :raises SystemExit: if runs are left over that no process works on any more
+    """
+    ledger = Ledger(open_storage(args.storage), study, args.grace)
+    ledger.open(sweep, describe(sweep, argv, args.device))
+    tally = Tally(sweep.file.steps)
+    workers = start_workers(args, study)
+    try:
+        with display(study) as show:
+            while True:
+                trials = ledger.trials()
+                show(tally.look(trials))
+                n_working = sum(worker.poll() is None for worker in workers)
+                if n_working == 0:
+                    break
+                time.sleep(LOOK)
+    except BaseException:
+        stop(workers)
+        print("Stopped. The same command goes on.", file=sys.stderr)
+        raise
+    finally:
+        folder = export_study(study, args.storage, args.results)
+    left = [trial for trial in ledger.trials() if not trial.state.is_finished()]
+    if left:
+        codes = ", ".join(str(worker.returncode) for worker in workers)
+        sys.exit(
+            f"{len(left)} runs of {study} are left over, but all workers have ended (exit codes {codes}): "
+            f"{args.logs / study}/worker-*.log say why. The same command goes on."
+        )
+    return folder
+
+
+def stop(workers: Sequence[subprocess.Popen[bytes]]) -> None:
+    """
+    Let processes save their runs' states, and end.
+
+    :param workers: the processes
+    """
+    for worker in workers:
+        if worker.poll() is None:
+            worker.send_signal(signal.SIGTERM)
+    try:
+        for worker in workers:
+            worker.wait()
+    except KeyboardInterrupt:
+        # Asked a second time
+        for worker in workers:
+            worker.kill()
+
+
+def hyperparameter(text: str) -> tuple[str, Any]:
+    """
+    Read a hyperparameter, as in ``learning_starts=500``.
+
+    :param text: the argument
+    :return: its name and value
+    :raises argparse.ArgumentTypeError: if it is not of that form
+    """
+    name, separator, value = text.partition("=")
+    if not separator or not name.isidentifier():
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form name=value")
+    try:
+        return name, yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} has a value that is no YAML: {error}") from error
+
+
+def parse(argv: Sequence[str]) -> argparse.Namespace:
+    """
+    Read the command line.
+
+    :param argv: the arguments
+    :return: what they say
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmark.sweep", description="Run a sweep, or go on with it.")
+    parser.add_argument("name", help="e1 to e8, the paper's, or the path of a sweep's file")
+    parser.add_argument("--task", nargs="+", help="environments, in place of the file's")
+    parser.add_argument("--steps", type=count, help="environment steps of each run, in place of the file's")
+    parser.add_argument("--seeds", type=count, help="how many seeds, from 0, in place of the file's")
+    parser.add_argument("--methods", nargs="+", help="those of the file's methods to take (default: all)")
+    parser.add_argument(
+        "--set", nargs="+", type=hyperparameter, default=[], metavar="NAME=VALUE", help="hyperparameters of all"
+    )
+    parser.add_argument(
+        "--eval-interval",
+        type=count,
+        help="environment steps between two evaluations (default: the file's, or a twentieth of --steps)",
+    )
+    parser.add_argument("--eval-episodes", type=count, help="episodes of each evaluation, in place of the file's")
+    parser.add_argument("--study", help="the study's name (default: the sweep's, with the tasks if they were replaced)")
+    parser.add_argument(
+        "--storage", default=DEFAULT_STORAGE, help="a database's URL, or grpc://host:port (default: %(default)s)"
+    )
+    parser.add_argument("--workers", type=count, default=1, help="processes on this machine (default: %(default)s)")
+    parser.add_argument("--threads", type=count, help="PyTorch's threads in each (default: the cores' share)")
+    parser.add_argument("--device", default="auto", help="where the networks compute (default: %(default)s)")
+    parser.add_argument("--logs", type=Path, default=Path("logs/sweeps"), help="where the runs go (default: %(default)s)")
+    parser.add_argument("--results", type=output_folder, default="benchmark/results/sweeps", help="where the results go")
+    parser.add_argument(
+        "--beat", type=float, default=BEAT, help="seconds between a worker's heartbeats (default: %(default)s)"
+    )
+    parser.add_argument("--grace", type=float, default=GRACE, help="seconds until a silent worker is given up")
+    return parser.parse_args(argv)
+
+
+def load(name: str, args: argparse.Namespace) -> Sweep:
+    """
+    Read a sweep with what the command line changes.
+
+    :param name: the sweep
+    :param args: the command line
+    :return: the sweep
+    """
+    interval = args.eval_interval
+    if interval is None and args.steps is not None:
+        interval = max(args.steps // 20, 1)
+    overrides = dict(
+        tasks=args.task,
+        steps=args.steps,
+        seeds=args.seeds,
+        evaluation_interval=interval,
+        evaluation_episodes=args.eval_episodes,
+        hyperparams=dict(args.set) or None,
+    )
+    return load_sweep(name, overrides, args.methods)
+
+
+def study_name(sweep: Sweep, args: argparse.Namespace) -> str:
+    """
+    Name a sweep's study.
+
+    :param sweep: the sweep
+    :param args: the command line
+    :return: the name
+    """
+    if args.study is not None:
+        return args.study
+    return "-".join([sweep.name, *(args.task or [])])
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """
+    Run a sweep.
+
+    :param argv: the command line; None for the process's own
+    """
+    argv = sys.argv[1:] if argv is None else argv
+    args = parse(argv)
+    try:
+        names = included_sweeps(args.name)
+        sweeps = [load(name, args) for name in names]
+        if args.study is not None and len(sweeps) > 1:
+            raise SweepError("the command line", "--study", f"names one study, but {args.name} is {len(sweeps)} sweeps")
+        folders = [run(sweep, study_name(sweep, args), args, argv) for sweep in sweeps]
+    except (SweepError, ValueError) as error:
+        sys.exit(f"Error: {error}")
+    except KeyboardInterrupt:
+        sys.exit(128 + signal.SIGINT)
+    from benchmark.figures import draw_figures
+
+    draw_figures(folders, args.results)
+
+
+if __name__ == "__main__":
+    main()
