@@ -25,9 +25,10 @@ from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from benchmark.experiments import Run, Sweep, SweepError
+from benchmark.experiments import Run, Sweep
 from benchmark.records import Record
 from benchmark.storages import patiently
+from benchmark.sweep_files import SweepError
 
 # Attributes of a study
 SWEEP = "sweep"

@@ -19,12 +19,13 @@ import torch as th
 import yaml
 
 from benchmark.arguments import count, output_folder
-from benchmark.experiments import Sweep, SweepError, included_sweeps, load_sweep
+from benchmark.experiments import Sweep, included_sweeps, load_sweep
 from benchmark.exports import export_study
 from benchmark.progress import Tally, display
 from benchmark.provenance import conditions
 from benchmark.storages import open_storage
 from benchmark.studies import Ledger
+from benchmark.sweep_files import SweepError
 from benchmark.worker import BEAT, GRACE
 
 DEFAULT_STORAGE = "sqlite:///logs/sweeps/studies.db"
