@@ -28,6 +28,30 @@ ZOO_HYPERPARAMS = (
 FINAL_EPISODES = 20
 
 
+def configuration_in_words(method: str, settings: dict[str, Any]) -> str:
+    """
+    Name a configuration.
+
+    :param method: the method
+    :param settings: the values of the axes, by axis
+    :return: the name
+    """
+    return ",".join([method, *(f"{axis}={value}" for axis, value in sorted(settings.items()))])
+
+
+def run_key(method: str, settings: dict[str, Any], task: str, seed: int) -> str:
+    """
+    Name a run as no other run of its study is named.
+
+    :param method: the method
+    :param settings: the values of the axes, by axis
+    :param task: the environment
+    :param seed: the seed
+    :return: the name
+    """
+    return f"{configuration_in_words(method, settings)},{task},seed={seed}"
+
+
 @dataclass(frozen=True)
 class Run:
     """
@@ -61,12 +85,12 @@ class Run:
     @property
     def configuration(self) -> str:
         """The method and the values of the axes, in words."""
-        return ",".join([self.method, *(f"{axis}={value}" for axis, value in self.settings.items())])
+        return configuration_in_words(self.method, self.settings)
 
     @property
     def key(self) -> str:
         """What tells the run from all others of its study."""
-        return f"{self.configuration},{self.task},seed={self.seed}"
+        return run_key(self.method, self.settings, self.task, self.seed)
 
 
 @dataclass(frozen=True)

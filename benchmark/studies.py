@@ -25,7 +25,7 @@ from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from benchmark.experiments import Run, Sweep
+from benchmark.experiments import Run, Sweep, run_key
 from benchmark.records import Record
 from benchmark.storages import patiently
 from benchmark.sweep_files import SweepError
@@ -80,12 +80,13 @@ class Ledger:
             self._study_id = patiently(self.storage.get_study_id_from_name, self.name)
         return self._study_id
 
-    def open(self, sweep: Sweep, description: dict[str, Any]) -> None:
+    def open(self, sweep: Sweep, description: dict[str, Any], ended: Iterable[Record] = ()) -> None:
         """
         Make the study if it is not there, and enqueue what it lacks.
 
         :param sweep: the sweep
         :param description: what is to be known of the sweep, as JSON has it
+        :param ended: runs that ended elsewhere, and need not be trained
         :raises SweepError: if the study is there with runs of the same names and other settings
         """
         try:
@@ -96,7 +97,8 @@ class Ledger:
         self._distributions = _distributions(sweep)
         self._check(runs, trials)
         patiently(self.storage.set_study_user_attr, self.study_id, SWEEP, description)
-        self.enqueue_missing(runs, trials)
+        self.adopt(ended, runs)
+        self.enqueue_missing(runs)
 
     def _check(self, runs: Sequence[Run], trials: Sequence[FrozenTrial]) -> None:
         # Optuna fixes what a study's parameters can be
@@ -151,6 +153,33 @@ class Ledger:
                     user_attrs={KEY: run.key, RUN: asdict(run)},
                 )
                 patiently(self.storage.create_new_trial, self.study_id, trial)
+
+    def adopt(self, records: Iterable[Record], runs: Sequence[Run]) -> int:
+        """
+        Enter runs that ended elsewhere, as far as they are not in the study.
+
+        :param records: their records
+        :param runs: the runs of the sweep
+        :return: how many were entered
+        """
+        by_key = {run.key: run for run in runs}
+        owners, n_adopted = owned(self.trials()), 0
+        for record in records:
+            key = run_key(record.method, record.settings, record.task, record.seed)
+            if key not in by_key or key in owners:
+                continue
+            attributes = {KEY: key, RUN: asdict(by_key[key]), PROGRESS: {"step": record.steps, "seconds": record.seconds}}
+            trial = create_trial(
+                state=TrialState.FAIL if record.final is None else TrialState.COMPLETE,
+                value=record.final,
+                params=_params(by_key[key]),
+                distributions=self._distributions,
+                user_attrs=attributes | {OUTCOME: "adopted"} | ({} if record.error is None else {ERROR: record.error}),
+                intermediate_values=dict(zip(record.timesteps, record.returns, strict=True)),
+            )
+            patiently(self.storage.create_new_trial, self.study_id, trial)
+            n_adopted += 1
+        return n_adopted
 
     def recover(self) -> None:
         """End the trials of processes that have fallen silent, and enqueue what is missing then."""

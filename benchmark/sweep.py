@@ -20,7 +20,7 @@ import yaml
 
 from benchmark.arguments import count, output_folder
 from benchmark.experiments import Sweep, included_sweeps, load_sweep
-from benchmark.exports import export_study
+from benchmark.exports import ended_runs, export_study
 from benchmark.progress import Tally, display
 from benchmark.provenance import conditions
 from benchmark.storages import open_storage
@@ -55,6 +55,7 @@ def describe(sweep: Sweep, argv: Sequence[str], device: str) -> dict[str, Any]:
         "evaluation_episodes": file.evaluation_episodes,
         "settings_in_words": "; ".join(sweep.changes),
         "runs_planned": len(sweep.runs()),
+        "configurations": {run.configuration: {"algo": run.algo, **run.hyperparams} for run in sweep.runs()},
         **conditions("benchmark.sweep", argv, th.device("cpu") if device == "auto" else th.device(device)),
     }
 
@@ -94,7 +95,9 @@ def run(sweep: Sweep, study: str, args: argparse.Namespace, argv: Sequence[str])
     :raises SystemExit: if runs are left over that no process works on any more
     """
     ledger = Ledger(open_storage(args.storage), study, args.grace)
-    ledger.open(sweep, describe(sweep, argv, args.device))
+    description = describe(sweep, argv, args.device)
+    ended, description["earlier"] = ended_runs(args.results / study, description) if args.adopt else ([], [])
+    ledger.open(sweep, description, ended)
     tally = Tally(sweep.file.steps)
     workers = start_workers(args, study)
     try:
