@@ -26,7 +26,7 @@ from benchmark.provenance import conditions
 from benchmark.storages import open_storage
 from benchmark.studies import Ledger
 from benchmark.sweep_files import SweepError
-from benchmark.worker import BEAT, GRACE
+from benchmark.worker import BEAT, GRACE, terminate
 
 DEFAULT_STORAGE = "sqlite:///logs/sweeps/studies.db"
 # Seconds between two looks at the study
@@ -192,6 +192,9 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--logs", type=Path, default=Path("logs/sweeps"), help="where the runs go (default: %(default)s)")
     parser.add_argument("--results", type=output_folder, default="benchmark/results/sweeps", help="where the results go")
     parser.add_argument(
+        "--adopt", action="store_true", help="take the ended runs that the folder of results has, trained elsewhere"
+    )
+    parser.add_argument(
         "--beat", type=float, default=BEAT, help="seconds between a worker's heartbeats (default: %(default)s)"
     )
     parser.add_argument("--grace", type=float, default=GRACE, help="seconds until a silent worker is given up")
@@ -241,6 +244,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     argv = sys.argv[1:] if argv is None else argv
     args = parse(argv)
+    signal.signal(signal.SIGTERM, terminate)
     try:
         names = included_sweeps(args.name)
         sweeps = [load(name, args) for name in names]

@@ -143,8 +143,15 @@ def _train_claimed(ledger: Ledger, claim: Claim, logs: Path, beat: float, parent
         raise
 
 
-def _end(number: int, frame: FrameType | None) -> None:
-    raise SystemExit(TERMINATED)
+def terminate(number: int, frame: FrameType | None) -> None:
+    """
+    End as a process that was told to.
+
+    :param number: the signal
+    :param frame: where the process was
+    :raises SystemExit: always
+    """
+    raise SystemExit(128 + number)
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -173,7 +180,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     :param argv: the command line; None for the process's own
     """
     args = parse(sys.argv[1:] if argv is None else argv)
-    signal.signal(signal.SIGTERM, _end)
+    signal.signal(signal.SIGTERM, terminate)
     # Ctrl-C in a terminal reaches all of its processes: this one's parent tells it to end
     if args.parent is not None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
