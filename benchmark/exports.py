@@ -1,13 +1,18 @@
 """A study's runs as small text files, for figures and to be kept in a repository."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 from benchmark.files import write_json
-from benchmark.records import write_records
+from benchmark.records import Record, read_records, write_records
 from benchmark.storages import open_storage
 from benchmark.studies import Ledger
+from benchmark.sweep_files import SweepError
 
 STUDY = "study.json"
+# Of what benchmark.provenance says
+CONDITIONS = ("command", "commit", "versions", "machine", "load_average")
 
 
 def export_study(name: str, storage_url: str, results: Path) -> Path:
@@ -25,3 +30,27 @@ def export_study(name: str, storage_url: str, results: Path) -> Path:
     write_json(folder / STUDY, ledger.description())
     write_records(folder, ledger.records())
     return folder
+
+
+def ended_runs(folder: Path, description: dict[str, Any]) -> tuple[list[Record], list[dict[str, Any]]]:
+    """
+    Read what was exported of a study's runs, to go on with it where its storage is not at hand.
+
+    :param folder: the study's folder of results
+    :param description: what the sweep is
+    :return: the runs, and under which conditions they were trained, from the first to the last
+    :raises SweepError: if they were trained with other settings, naming one
+    """
+    if not (folder / STUDY).is_file():
+        return [], []
+    was = json.loads((folder / STUDY).read_text())
+    for key in ("steps", "evaluation_interval", "evaluation_episodes", "configurations"):
+        now = description[key]
+        if key == "configurations":
+            both = was[key].keys() & now.keys()
+            same = all(was[key][name] == now[name] for name in both)
+        else:
+            same = was[key] == now
+        if not same:
+            raise SweepError(folder / STUDY, key, "differs from the sweep's, so that its runs cannot be adopted")
+    return read_records(folder), [*was.get("earlier", []), {key: was[key] for key in CONDITIONS}]

@@ -10,7 +10,7 @@ import grpc
 import optuna
 from optuna.storages import BaseStorage, GrpcStorageProxy, RDBStorage, get_storage
 from sqlalchemy import create_engine, event
-from sqlalchemy.engine import make_url
+from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 Result = TypeVar("Result")
@@ -40,20 +40,24 @@ def open_storage(url: str) -> BaseStorage:
         return GrpcStorageProxy(host=parts.hostname, port=parts.port)
     try:
         database = make_url(url)
+        # What SQLAlchemy takes for PostgreSQL's driver depends on its version
+        if database.drivername == "postgresql":
+            database = database.set(drivername="postgresql+psycopg2")
         # The driver of the database
         create_engine(database)
     except (ArgumentError, ImportError) as error:
         raise ValueError(f"The value of `storage` is {url!r}, but must be a database's URL: {error}") from error
     if database.get_backend_name() != "sqlite":
-        return get_storage(_open_database(url, {"pool_pre_ping": True}))
+        return get_storage(_open_database(database, {"pool_pre_ping": True}))
     if database.database:
         Path(database.database).parent.mkdir(parents=True, exist_ok=True)
-    storage = _open_database(url, {"connect_args": {"timeout": SQLITE_TIMEOUT}})
+    storage = _open_database(database, {"connect_args": {"timeout": SQLITE_TIMEOUT}})
     _make_transactions_exclusive(storage)
     return get_storage(storage)
 
 
-def _open_database(url: str, engine_kwargs: dict[str, Any]) -> RDBStorage:
+def _open_database(database: URL, engine_kwargs: dict[str, Any]) -> RDBStorage:
+    url = database.render_as_string(hide_password=False)
     # Of several processes that find no tables, all but one fail in making them
     return patiently(RDBStorage, url, engine_kwargs, patience=TABLES_TIMEOUT)
 

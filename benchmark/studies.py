@@ -29,14 +29,16 @@ from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from benchmark.experiments import Run, Sweep, SweepError
+from benchmark.experiments import Run, Sweep, run_key
 from benchmark.records import Record
+from benchmark.silence import PROGRESS, Silence
 from benchmark.storages import patiently
+from benchmark.sweep_files import SweepError
 
 # Attributes of a study
 SWEEP = "sweep"
 # Attributes of a trial
-RUN, KEY, ERROR, PROGRESS, WORKER, OUTCOME = "run", "key", "error", "progress", "worker", "outcome"
+RUN, KEY, ERROR, WORKER, OUTCOME = "run", "key", "error", "worker", "outcome"
 
 
 class TrialLostError(RuntimeError):
@@ -80,12 +82,13 @@ class Ledger:
             self._study_id = patiently(self.storage.get_study_id_from_name, self.name)
         return self._study_id
 
-    def open(self, sweep: Sweep, description: dict[str, Any]) -> None:
+    def open(self, sweep: Sweep, description: dict[str, Any], ended: Iterable[Record] = ()) -> None:
         """
         Make the study if it is not there, and enqueue what it lacks.
 
         :param sweep: the sweep
         :param description: what is to be known of the sweep, as JSON has it
+        :param ended: runs that ended elsewhere, and need not be trained
         :raises SweepError: if the study is there with runs of the same names and other settings
         """
         try:
@@ -96,7 +99,8 @@ class Ledger:
         self._distributions = _distributions(sweep)
         self._check(runs, trials)
         patiently(self.storage.set_study_user_attr, self.study_id, SWEEP, description)
-        self.enqueue_missing(runs, trials)
+        self.adopt(ended, runs)
+        self.enqueue_missing(runs)
 
     def _check(self, runs: Sequence[Run], trials: Sequence[FrozenTrial]) -> None:
         # Optuna fixes what a study's parameters can be
@@ -152,6 +156,33 @@ class Ledger:
                     user_attrs={KEY: run.key, RUN: asdict(run)},
                 )
                 patiently(self.storage.create_new_trial, self.study_id, trial)
+
+    def adopt(self, records: Iterable[Record], runs: Sequence[Run]) -> int:
+        """
+        Enter runs that ended elsewhere, as far as they are not in the study.
+
+        :param records: their records
+        :param runs: the runs of the sweep
+        :return: how many were entered
+        """
+        by_key = {run.key: run for run in runs}
+        owners, n_adopted = owned(self.trials()), 0
+        for record in records:
+            key = run_key(record.method, record.settings, record.task, record.seed)
+            if key not in by_key or key in owners:
+                continue
+            attributes = {KEY: key, RUN: asdict(by_key[key]), PROGRESS: {"step": record.steps, "seconds": record.seconds}}
+            trial = create_trial(
+                state=TrialState.FAIL if record.final is None else TrialState.COMPLETE,
+                value=record.final,
+                params=_params(by_key[key]),
+                distributions=self._distributions,
+                user_attrs=attributes | {OUTCOME: "adopted"} | ({} if record.error is None else {ERROR: record.error}),
+                intermediate_values=dict(zip(record.timesteps, record.returns, strict=True)),
+            )
+            patiently(self.storage.create_new_trial, self.study_id, trial)
+            n_adopted += 1
+        return n_adopted
 
     def recover(self) -> None:
         """End the trials of processes that have fallen silent, and enqueue what is missing then."""
@@ -292,40 +323,6 @@ class Ledger:
         for trial in trials:
             spent[trial.user_attrs[KEY]] += _seconds(trial)
         return [_record(experiment, trial, spent[key]) for key, trial in owned(trials).items() if trial.state.is_finished()]
-
-
-class Silence:
-    """
-    Finds trials whose processes have fallen silent.
-
-    :param grace: seconds of silence after which a process is taken for lost
-    :param clock: tells seconds
-    """
-
-    def __init__(self, grace: float, clock: Callable[[], float] = time.monotonic):
-        self._grace = grace
-        self._clock = clock
-        # By trial, the heartbeat that was seen last, and when it was first seen
-        self._seen: dict[int, tuple[Any, float]] = {}
-
-    def find(self, trials: Iterable[FrozenTrial]) -> list[FrozenTrial]:
-        """
-        Look at a study's trials.
-
-        :param trials: the trials
-        :return: those that run, and whose heartbeat has stood still since a look that is long ago
-        """
-        now = self._clock()
-        silent = []
-        for trial in trials:
-            if trial.state is TrialState.RUNNING:
-                beat = trial.user_attrs.get(PROGRESS)
-                seen, since = self._seen.setdefault(trial.number, (beat, now))
-                if seen != beat:
-                    self._seen[trial.number] = beat, now
-                elif now - since > self._grace:
-                    silent.append(trial)
-        return silent
 
 
 def is_open_or_ended(trial: FrozenTrial) -> bool:

@@ -19,13 +19,14 @@ import torch as th
 import yaml
 
 from benchmark.arguments import count, output_folder
-from benchmark.experiments import Sweep, SweepError, included_sweeps, load_sweep
-from benchmark.exports import export_study
+from benchmark.experiments import Sweep, included_sweeps, load_sweep
+from benchmark.exports import ended_runs, export_study
 from benchmark.progress import Tally, display
 from benchmark.provenance import conditions
 from benchmark.storages import open_storage
 from benchmark.studies import Ledger
-from benchmark.worker import BEAT, GRACE
+from benchmark.sweep_files import SweepError
+from benchmark.worker import BEAT, GRACE, terminate
 
 DEFAULT_STORAGE = "sqlite:///logs/sweeps/studies.db"
 # Seconds between two looks at the study
@@ -54,6 +55,7 @@ def describe(sweep: Sweep, argv: Sequence[str], device: str) -> dict[str, Any]:
         "evaluation_episodes": file.evaluation_episodes,
         "settings_in_words": "; ".join(sweep.changes),
         "runs_planned": len(sweep.runs()),
+        "configurations": {run.configuration: {"algo": run.algo, **run.hyperparams} for run in sweep.runs()},
         **conditions("benchmark.sweep", argv, th.device("cpu") if device == "auto" else th.device(device)),
     }
 
@@ -93,7 +95,9 @@ def run(sweep: Sweep, study: str, args: argparse.Namespace, argv: Sequence[str])
     :raises SystemExit: if runs are left over that no process works on any more
     """
     ledger = Ledger(open_storage(args.storage), study, args.grace)
-    ledger.open(sweep, describe(sweep, argv, args.device))
+    description = describe(sweep, argv, args.device)
+    ended, description["earlier"] = ended_runs(args.results / study, description) if args.adopt else ([], [])
+    ledger.open(sweep, description, ended)
     tally = Tally(sweep.file.steps)
     workers = start_workers(args, study)
     try:
@@ -188,6 +192,9 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--logs", type=Path, default=Path("logs/sweeps"), help="where the runs go (default: %(default)s)")
     parser.add_argument("--results", type=output_folder, default="benchmark/results/sweeps", help="where the results go")
     parser.add_argument(
+        "--adopt", action="store_true", help="take the ended runs that the folder of results has, trained elsewhere"
+    )
+    parser.add_argument(
         "--beat", type=float, default=BEAT, help="seconds between a worker's heartbeats (default: %(default)s)"
     )
     parser.add_argument("--grace", type=float, default=GRACE, help="seconds until a silent worker is given up")
@@ -237,6 +244,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     argv = sys.argv[1:] if argv is None else argv
     args = parse(argv)
+    signal.signal(signal.SIGTERM, terminate)
     try:
         names = included_sweeps(args.name)
         sweeps = [load(name, args) for name in names]

@@ -144,11 +144,18 @@ def _train_claimed(ledger: Ledger, claim: Claim, logs: Path, beat: float, parent
         raise
 
 
-def _end(number: int, frame: FrameType | None) -> None:
-    raise SystemExit(TERMINATED)
+def terminate(number: int, frame: FrameType | None) -> None:
+    """
+    End as a process that was told to.
+
+    :param number: the signal
+    :param frame: where the process was
+    :raises SystemExit: always
+    """
+    raise SystemExit(128 + number)
 
 
-def _terminate(number: int, frame: FrameType | None) -> None:
+def _terminate_as_asked(number: int, frame: FrameType | None) -> None:
     signal.raise_signal(signal.SIGTERM)
 
 
@@ -178,10 +185,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     :param argv: the command line; None for the process's own
     """
     args = parse(sys.argv[1:] if argv is None else argv)
-    signal.signal(signal.SIGTERM, _end)
+    signal.signal(signal.SIGTERM, terminate)
     # Ctrl-C in a terminal reaches all of its processes: this one's parent tells it to end. Without one it is to give its run
     # back: rl_zoo3 takes Ctrl-C for a training's end.
-    signal.signal(signal.SIGINT, _terminate if args.parent is None else signal.SIG_IGN)
+    signal.signal(signal.SIGINT, _terminate_as_asked if args.parent is None else signal.SIG_IGN)
     th.set_num_threads(args.threads)
     arguments: dict[str, Any] = dict(beat=args.beat, parent=args.parent, device=args.device)
     ledger = Ledger(patiently(open_storage, args.storage), args.study, args.grace)

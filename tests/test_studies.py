@@ -15,9 +15,10 @@ from optuna.trial import TrialState
 from studies import GRACE, Clock, Crew, assert_each_run_once, make_sweep, mortal, pretend, pretend_to_train, work_through
 
 from benchmark import worker
-from benchmark.experiments import SweepError
+from benchmark.silence import PROGRESS
 from benchmark.storages import open_storage, patiently
-from benchmark.studies import ERROR, KEY, OUTCOME, PROGRESS, Ledger, TrialLostError
+from benchmark.studies import ERROR, KEY, OUTCOME, Ledger, TrialLostError
+from benchmark.sweep_files import SweepError
 from benchmark.worker import work
 
 

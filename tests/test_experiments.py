@@ -1,0 +1,156 @@
+"""The files of sweeps: what they say, what follows from them, and what is refused."""
+
+import itertools
+from collections import Counter
+
+import pytest
+import yaml
+
+from benchmark.experiments import included_sweeps, load_sweep, sweeps_folder
+from benchmark.sweep_files import SweepError
+
+GOOD = dict(title="A sweep", methods=["TD3", "CGP-Online"], tasks=["Pendulum-v1"], steps=100, seeds=2, evaluation_interval=10)
+PAPER = ["e1", "e3", "e4", "e5", "e6", "e7", "e8"]
+
+
+@pytest.fixture
+def sweep_of(tmp_path):
+    """Write a sweep's file, and read it."""
+
+    def write_and_load(**changes):
+        path = tmp_path / "mine.yml"
+        path.write_text(yaml.safe_dump({key: value for key, value in (GOOD | changes).items() if value is not None}))
+        return load_sweep(str(path))
+
+    return write_and_load
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_the_papers_sweeps_have_each_run_once(name):
+    sweep = load_sweep(name)
+    keys = Counter(run.key for run in sweep.runs())
+    assert set(keys.values()) == {1}
+    combinations = list(itertools.product(*(axis.values for axis in sweep.file.axes.values())))
+    assert len(keys) == (len(combinations) - len(sweep.file.exclude)) * len(sweep.methods) * 4 * len(sweep.file.tasks)
+    assert all((run.steps, run.evaluation_interval) == (1_000_000, 10_000) for run in sweep.runs())
+
+
+def test_the_papers_sweeps_are_as_many_runs_as_it_has_combinations():
+    assert {name: len(load_sweep(name).runs()) for name in PAPER} == {
+        "e1": 9 * 5 * 4,
+        "e3": 4 * 2 * 3 * 4,
+        "e4": 3 * 4 * 4,
+        "e5": 4 * 4 * 4,
+        "e6": 4 * (3 * 4 - 2) * 4,
+        "e7": 2 * 3 * 4,
+        "e8": 4 * 2 * 4,
+    }
+    assert included_sweeps("e2") == ["e4", "e5", "e6", "e7", "e8"]
+
+
+def test_each_files_name_is_known():
+    for path in sweeps_folder().glob("*.yml"):
+        if path.name != "methods.yml":
+            assert all(load_sweep(name).runs() for name in included_sweeps(path.stem))
+
+
+def settings_of(name, method):
+    """What a method is trained with, by the values of the axes."""
+    return {tuple(run.settings.values()): run.hyperparams for run in load_sweep(name).runs() if run.method == method}
+
+
+def test_all_sources_of_noise_are_varied():
+    for method in ("CGP-Online", "TD3"):
+        for (value,), hyperparams in settings_of("e4", method).items():
+            assert (hyperparams["noise_type"], hyperparams["noise_std"]) == ("normal", value)
+            assert hyperparams["target_policy_noise"] == value
+    for (value,), hyperparams in settings_of("e4", "DDPG").items():
+        assert hyperparams["noise_std"] == value
+        assert "target_policy_noise" not in hyperparams
+
+
+def test_all_networks_have_the_width():
+    for method in ("CGP-Online", "DDPG", "TD3", "SAC"):
+        for (width,), hyperparams in settings_of("e5", method).items():
+            assert eval(hyperparams["policy_kwargs"]) == dict(net_arch=[width, width])
+
+
+def test_learning_rates_and_batches_leave_the_far_corners_out():
+    settings = settings_of("e6", "SAC")
+    assert set(itertools.product([1e-2, 1e-3, 1e-4], [256, 128, 64, 32])) - set(settings) == {(1e-4, 256), (1e-2, 32)}
+    for (learning_rate, batch_size), hyperparams in settings.items():
+        assert (hyperparams["learning_rate"], hyperparams["batch_size"]) == (learning_rate, batch_size)
+
+
+def test_named_values_set_several_hyperparameters():
+    by_name = settings_of("e8", "TD3")
+    assert (by_name["step",]["train_freq"], by_name["step",]["gradient_steps"]) == ([1, "step"], 1)
+    assert (by_name["episode",]["train_freq"], by_name["episode",]["gradient_steps"]) == ([1, "episode"], -1)
+
+
+def test_later_settings_go_before_earlier_ones(tmp_path, sweep_of):
+    sweep_of(hyperparams={"gamma": 0.9, "batch_size": 7}, axes={"batch_size": {"values": [8, 16]}})
+    sweep = load_sweep(str(tmp_path / "mine.yml"), {"hyperparams": {"gamma": 0.5, "tau": 0.1}, "seeds": 1}, ["TD3"])
+    assert [(run.hyperparams["gamma"], run.hyperparams["tau"], run.hyperparams["batch_size"]) for run in sweep.runs()] == [
+        (0.5, 0.1, 8),
+        (0.5, 0.1, 16),
+    ]
+    assert sweep.runs()[0].key == "TD3,batch_size=8,Pendulum-v1,seed=0"
+
+
+def test_methods_of_ones_own(sweep_of):
+    sweep = sweep_of(methods={"mine": {"algo": "ppo", "hyperparams": {"n_steps": 64}, "tuned": True}})
+    assert {(run.method, run.algo, run.tuned) for run in sweep.runs()} == {("mine", "ppo", True)}
+
+
+def test_a_subset_of_seeds_and_a_checkpoint_interval(sweep_of):
+    sweep = sweep_of(seeds=[3, 5], checkpoint_interval=25)
+    assert {(run.seed, run.checkpoint_interval) for run in sweep.runs()} == {(3, 25), (5, 25)}
+    assert {run.checkpoint_interval for run in load_sweep("e3").runs()} == {10_000}
+
+
+@pytest.mark.parametrize(
+    ("changes", "key", "allowed"),
+    [
+        (dict(tasks=["Pendulum-v7"]), "tasks", "such as Pendulum-v1"),
+        (dict(steps=0), "steps", "greater than 0"),
+        (dict(steps=None), "steps", "required"),
+        (dict(seeds=[-1]), "seeds", "greater than or equal to 0"),
+        (dict(stepz=3), "stepz", "must be one of title, methods"),
+        (dict(methods=["TD4"]), "methods", "must be one of CGP-Online"),
+        (dict(methods={"A": {"algo": "td4"}}), "methods.A", "must be one of a2c"),
+        (dict(axes={"gamma": {"values": []}}), "axes.gamma.values", "at least 1"),
+        (dict(axes={"gamma": {"values": [0.5, 0.5]}}), "axes.gamma", "differ"),
+        (dict(axes={"gamma": {"values": {"a": {}}, "sets": {}}}), "axes.gamma", "for a list of values"),
+        (dict(axes={"x": {"values": [1], "sets_for": {"SAC": {}}}}), "SAC", "one of ['TD3', 'CGP-Online']"),
+        (dict(exclude=[{"gamma": 1}]), "gamma", "must name one of"),
+        (dict(axes={"gamma": {"values": [0.5]}}, exclude=[{"gamma": 1}]), "gamma", "must have one of [0.5]"),
+        (dict(hyperparams={"learning_rte": 1}), "learning_rte", "learning_rate"),
+        (dict(axes={"cem_samples": {"values": [8]}}), "cem_samples", "of TD3"),
+    ],
+)
+def test_a_mistake_is_named_with_what_is_allowed(tmp_path, sweep_of, changes, key, allowed):
+    with pytest.raises(SweepError) as error:
+        sweep_of(**changes)
+    assert all(part in str(error.value) for part in (str(tmp_path / "mine.yml"), key, allowed)), str(error.value)
+
+
+def test_no_sweep_of_that_name():
+    with pytest.raises(SweepError, match="must be one of e1, e2"):
+        load_sweep("e9")
+
+
+def test_what_the_command_line_changes_is_checked_too():
+    with pytest.raises(SweepError, match="the command line: steps"):
+        load_sweep("e1", {"steps": 0})
+    with pytest.raises(SweepError, match="'PPO' must be one of CGP-Online"):
+        load_sweep("e1", methods=["PPO"])
+
+
+def test_a_file_that_is_no_mapping(tmp_path):
+    (tmp_path / "mine.yml").write_text("- a")
+    with pytest.raises(SweepError, match="mapping"):
+        load_sweep(str(tmp_path / "mine.yml"))
+    (tmp_path / "mine.yml").write_text("a: [")
+    with pytest.raises(SweepError, match="cannot be read"):
+        load_sweep(str(tmp_path / "mine.yml"))

@@ -1,0 +1,146 @@
+"""One run of a sweep: trained by rl_zoo3, reported as it goes, and the same if it was interrupted."""
+
+import numpy as np
+import pytest
+import yaml
+from rl_zoo3 import ALGOS
+from rl_zoo3.utils import get_saved_hyperparams
+from stable_baselines3 import TD3
+from stable_baselines3.common.env_util import make_vec_env
+
+from benchmark.experiments import load_sweep
+from benchmark.random_actions import RandomActions
+from benchmark.report import read_curve, run_in
+from benchmark.run import forget_states, run_folder, train
+from sb3_cgp.resumable import ResumableAlgorithm, resumable
+
+TINY = dict(learning_starts=40, batch_size=8, buffer_size=400, policy_kwargs="dict(net_arch=[8, 8])")
+
+
+class Interruption(Exception):
+    """Whatever may end a training; not the run's own fault in these tests."""
+
+
+@pytest.fixture
+def run_of(tmp_path):
+    """Make the only run of a tiny sweep."""
+
+    def make(algo="td3", task="Pendulum-v1", tuned=False, **hyperparams):
+        content = dict(
+            title="A sweep",
+            methods={"M": {"algo": algo, "hyperparams": {"policy": "MlpPolicy"} | hyperparams, "tuned": tuned}},
+            tasks=[task],
+            steps=500,
+            seeds=[3],
+            evaluation_interval=100,
+            evaluation_episodes=2,
+            checkpoint_interval=60,
+        )
+        (tmp_path / "mine.yml").write_text(yaml.safe_dump(content))
+        (run,) = load_sweep(str(tmp_path / "mine.yml")).runs()
+        return run
+
+    return make
+
+
+def trained(run, folder, *stops):
+    """Train a run, interrupting it at the given steps, and return its final return and all that was reported."""
+    for stop in [*stops, None]:
+        reports = {}
+
+        def watch(step, stop=stop):
+            if stop is not None and step >= stop:
+                raise Interruption
+
+        try:
+            return train(run, folder, reports.__setitem__, watch, "cpu"), reports
+        except Interruption:
+            assert stop is not None
+            np.random.seed(stop)  # noqa: NPY002  # another process has other random numbers
+
+
+def policy_of(folder, algo):
+    return ALGOS[algo].load(run_in(folder).model_path).policy.state_dict()
+
+
+@pytest.mark.parametrize("algo", ["cgp", "td3", "ddpg", "sac", "tqc", "crossq"])
+def test_an_interrupted_run_is_an_undisturbed_one(tmp_path, run_of, algo):
+    run = run_of(algo, **TINY)
+    final, reports = trained(run, tmp_path / "straight")
+    assert (tmp_path / "straight" / "Pendulum-v1.zip").is_file()
+    assert trained(run, tmp_path / "stopped", 130, 390) == (final, reports)
+    straight, stopped = (policy_of(tmp_path / name, algo) for name in ("straight", "stopped"))
+    for name, value in straight.items():
+        np.testing.assert_array_equal(stopped[name], value, err_msg=name)
+
+
+def test_reports_are_the_usual_evaluations(tmp_path, run_of):
+    _, reports = trained(run_of(**TINY), tmp_path)
+    curve = read_curve(tmp_path)
+    assert reports == dict(zip(curve.timesteps, curve.mean, strict=True))
+    assert list(reports) == [100, 200, 300, 400, 500]
+
+
+def test_offline_training_adds_no_points_and_is_scored_at_its_end(tmp_path, run_of, monkeypatch):
+    monkeypatch.setattr("sb3_cgp.offline.ROUND", 60)
+    final, reports = trained(run_of("cgp", **TINY, policy_training="offline"), tmp_path)
+    assert list(reports) == [100, 200, 300, 400, 500]
+    model = ALGOS["cgp"].load(run_in(tmp_path).model_path)
+    assert model.policy.inference == "actor"
+    assert np.isfinite(final)
+
+
+def test_the_other_scripts_of_rl_zoo3_find_what_they_look_for(tmp_path, run_of):
+    run = run_of(**TINY, normalize=True)
+    folder = run_folder(tmp_path, "study", run)
+    trained(run, folder)
+    forget_states(folder)
+    assert folder == tmp_path / "study" / "M" / "td3" / "Pendulum-v1_4"
+    found = run_in(folder)
+    assert (found.read_yaml("config.yml")["batch_size"], found.read_yaml("args.yml")["seed"]) == (8, 3)
+    hyperparams, stats_path = get_saved_hyperparams(str(found.settings_folder), norm_reward=False)
+    assert hyperparams["normalize"]
+    assert stats_path == str(found.settings_folder)
+    assert not (folder / "state").exists()
+
+
+def test_what_is_trained_is_what_the_sweep_says(tmp_path, run_of):
+    trained(run_of("sac", **TINY, learning_rate=0.002, gamma=0.9), tmp_path)
+    model = ALGOS["sac"].load(run_in(tmp_path).model_path)
+    assert (model.learning_rate(1.0), model.gamma, model.batch_size, model.learning_starts) == (0.002, 0.9, 8, 40)
+    assert model.num_timesteps == 500
+
+
+def test_a_tuned_method_starts_from_the_tasks_entry(tmp_path, run_of):
+    run = run_of("cgp", tuned=True, **TINY)
+    trained(run, tmp_path)
+    model = ALGOS["cgp"].load(run_in(tmp_path).model_path)
+    assert (model.tau, model.gamma, model.batch_size) == (0.02, 0.98, 8)
+    assert model.num_timesteps == 500
+
+
+def test_algorithms_without_states_start_anew(tmp_path, run_of):
+    run = run_of("ppo", n_steps=64, batch_size=32, policy_kwargs="dict(net_arch=[8])")
+    final, reports = trained(run, tmp_path / "straight")
+    assert trained(run, tmp_path / "stopped", 200) == (final, reports)
+
+
+def test_random_actions_are_uniform_and_learn_nothing(tmp_path, run_of):
+    _, reports = trained(run_of("random"), tmp_path)
+    assert len(reports) == 5
+    model = RandomActions("MlpPolicy", make_vec_env("Pendulum-v1", n_envs=3, seed=0), seed=0)
+    model.learn(300)
+    assert model._n_updates == 0
+    actions = np.concatenate([model.predict(model.env.reset())[0] for _ in range(700)])
+    assert actions.shape == (2100, 1)
+    np.testing.assert_allclose(np.histogram(actions, bins=4, range=(-2, 2))[0] / 2100, 0.25, atol=0.04)
+    assert model.predict(model.env.reset()[0])[0].shape == (1,)
+
+
+def test_resumable_changes_nothing_else():
+    assert issubclass(resumable(TD3), (TD3, ResumableAlgorithm))
+    assert resumable(resumable(TD3)).__name__ == "TD3"
+    arguments = dict(learning_starts=10, batch_size=8, policy_kwargs=dict(net_arch=[8]), seed=0)
+    plain, with_states = (each("MlpPolicy", "Pendulum-v1", **arguments).learn(60) for each in (TD3, resumable(TD3)))
+    for name, value in plain.policy.state_dict().items():
+        np.testing.assert_array_equal(with_states.policy.state_dict()[name], value, err_msg=name)
