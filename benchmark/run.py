@@ -1,8 +1,11 @@
 """One run of a sweep, trained by rl_zoo3 in a folder of its own, and taken up again from its last state if there is one."""
 
 import argparse
+import json
+import math
 import shutil
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,8 @@ from sb3_cgp.resume import ResumedExperiment
 from sb3_cgp.store import StateStore
 from sb3_cgp.zoo import register, state_folder
 
+# What a run's states belong to, in its folder
+SETTINGS = "run.json"
 # Takes environment steps and the mean return of an evaluation
 Report = Callable[[int, float], None]
 
@@ -45,7 +50,7 @@ def run_folder(logs: Path, study: str, run: Run) -> Path:
 
 def train(run: Run, folder: Path, report: Report, watch: Callable[[int], None], device: str = "auto") -> float:
     """
-    Train a run to its end.
+    Train a run to its end, from its last state if there is one.
 
     :param run: the run
     :param folder: the run's folder
@@ -53,9 +58,11 @@ def train(run: Run, folder: Path, report: Report, watch: Callable[[int], None], 
     :param watch: is told the environment steps at every step, and may raise
     :param device: where the networks compute
     :return: mean return of the final model over episodes that are the same for all runs of a task
+    :raises FloatingPointError: if that is no finite number
     """
     register()
     register_random_actions()
+    _begin(run, folder)
     set_random_seed(run.seed)
     manager = _manager(run, folder, device)
     model, _ = manager.setup_experiment()  # type: ignore[misc]
@@ -64,17 +71,37 @@ def train(run: Run, folder: Path, report: Report, watch: Callable[[int], None], 
     manager.learn(model)
     manager.save_trained_model(model)
     final = _final_return(model, evaluation)
-    shutil.rmtree(state_folder(str(folder)), ignore_errors=True)
+    if not math.isfinite(final):
+        raise FloatingPointError(f"The final model's mean return is {final}")
     return final
+
+
+def forget_states(folder: Path) -> None:
+    """
+    Remove what a run would be taken up again from.
+
+    :param folder: the run's folder
+    """
+    shutil.rmtree(state_folder(str(folder)), ignore_errors=True)
+
+
+def _begin(run: Run, folder: Path) -> None:
+    """See that no run is taken up from the states of another, which a study of the same name has left there."""
+    settings = json.dumps(asdict(run)).encode()
+    path = folder / SETTINGS
+    if not path.is_file() or path.read_bytes() != settings:
+        forget_states(folder)
+        write_atomically(path, settings)
 
 
 def _manager(run: Run, folder: Path, device: str) -> ExperimentManager:
     """Make rl_zoo3's manager of a run that starts, or goes on."""
     ALGOS[run.algo] = _with_states(ALGOS[run.algo])
-    hyperparams = _hyperparams(run)
     args = _arguments(run, folder, device)
     if StateStore(state_folder(str(folder))).steps():
-        return ResumedExperiment(folder, args, hyperparams)
+        # Those of the algorithm's YAML file among them
+        (saved,) = folder.glob("*/config.yml")
+        return ResumedExperiment(folder, args, dict(yaml.load(saved.read_text(), Loader=yaml.UnsafeLoader)))
     manager = ExperimentManager(
         args,
         run.algo,
@@ -88,7 +115,7 @@ def _manager(run: Run, folder: Path, device: str) -> ExperimentManager:
         seed=run.seed,
         verbose=0,
         device=device,
-        hyperparams=hyperparams if run.tuned else None,
+        hyperparams=_hyperparams(run) if run.tuned else None,
     )
     manager.save_path = str(folder)
     manager.params_path = f"{folder}/{manager.env_name}"
@@ -165,11 +192,18 @@ class _Reporter(BaseCallback):
 
     def _on_step(self) -> bool:
         self._watch(self.num_timesteps)
+        self._tell()
+        return True
+
+    def _on_training_end(self) -> None:
+        # A run that is taken up from its last step takes no other
+        self._tell()
+
+    def _tell(self) -> None:
         timesteps, results = self._evaluation.evaluations_timesteps, self._evaluation.evaluations_results
         for step, returns in _new_points(timesteps, results, self._n_reported):
             self._report(step, float(np.mean(returns)))
         self._n_reported = len(timesteps)
-        return True
 
     def get_training_state(self) -> dict[str, Any]:
         """

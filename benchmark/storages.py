@@ -19,6 +19,8 @@ Result = TypeVar("Result")
 STORAGE_ERRORS = (optuna.exceptions.StorageInternalError, SQLAlchemyError, grpc.RpcError, ConnectionError)
 # Seconds that SQLite waits for another process's writing
 SQLITE_TIMEOUT = 120
+# Seconds of patience with other processes that are making the same tables
+TABLES_TIMEOUT = 5.0
 
 
 def open_storage(url: str) -> BaseStorage:
@@ -43,12 +45,17 @@ def open_storage(url: str) -> BaseStorage:
     except (ArgumentError, ImportError) as error:
         raise ValueError(f"The value of `storage` is {url!r}, but must be a database's URL: {error}") from error
     if database.get_backend_name() != "sqlite":
-        return get_storage(RDBStorage(url, engine_kwargs={"pool_pre_ping": True}))
+        return get_storage(_open_database(url, {"pool_pre_ping": True}))
     if database.database:
         Path(database.database).parent.mkdir(parents=True, exist_ok=True)
-    storage = RDBStorage(url, engine_kwargs={"connect_args": {"timeout": SQLITE_TIMEOUT}})
+    storage = _open_database(url, {"connect_args": {"timeout": SQLITE_TIMEOUT}})
     _make_transactions_exclusive(storage)
     return get_storage(storage)
+
+
+def _open_database(url: str, engine_kwargs: dict[str, Any]) -> RDBStorage:
+    # Of several processes that find no tables, all but one fail in making them
+    return patiently(RDBStorage, url, engine_kwargs, patience=TABLES_TIMEOUT)
 
 
 def _make_transactions_exclusive(storage: RDBStorage) -> None:

@@ -9,13 +9,17 @@ three rules, which whoever looks at the study applies:
 - A run without a trial that waits, runs, or has ended for good (completed, or failed with an error) gets a new one.
 - Of several such trials, only the first is the run's. Whoever claims another gives it up.
 
+A study is worked off when each run's own trial has ended for good; that no trial is open is not enough, as a process may
+die, or be slow, between ending one and enqueueing the next.
+
 So no run is skipped and none counts twice, whichever processes die between which two steps. Optuna's own heartbeat would
 serve databases alone, not its proxy.
 """
 
+import json
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -47,12 +51,10 @@ class Claim:
 
     :param trial_id: the trial
     :param run: the run
-    :param seconds: what earlier attempts took
     """
 
     trial_id: int
     run: Run
-    seconds: float
 
 
 class Ledger:
@@ -62,16 +64,15 @@ class Ledger:
     :param storage: where the study is
     :param name: the study's name
     :param grace: seconds of silence after which a process is taken for lost
+    :param clock: tells seconds
     """
 
-    def __init__(self, storage: BaseStorage, name: str, grace: float = 60.0):
+    def __init__(self, storage: BaseStorage, name: str, grace: float = 60.0, clock: Callable[[], float] = time.monotonic):
         self.storage = storage
         self.name = name
-        self.grace = grace
+        self._silence = Silence(grace, clock)
         self._study_id: int | None = None
         self._distributions: dict[str, BaseDistribution] = {}
-        # By trial, the heartbeat that was seen last, and when
-        self._heartbeats: dict[int, tuple[Any, float]] = {}
 
     @property
     def study_id(self) -> int:
@@ -108,7 +109,7 @@ class Ledger:
             )
         present = {trial.user_attrs[KEY]: trial.user_attrs[RUN] for trial in trials}
         for run in runs:
-            was, now = present.get(run.key), asdict(run)
+            was, now = present.get(run.key), json.loads(json.dumps(asdict(run)))
             if was is not None and was != now:
                 differing = next(name for name in now if was.get(name) != now[name])
                 raise SweepError(
@@ -142,10 +143,11 @@ class Ledger:
         :param trials: the study's trials, if they were just read
         """
         trials = self.trials() if trials is None else trials
-        owners = owned(trials)
+        keys = set(owned(trials))
         distributions = trials[0].distributions if trials else self._distributions
         for run in runs:
-            if run.key not in owners:
+            if run.key not in keys:
+                keys.add(run.key)
                 trial = create_trial(
                     state=TrialState.WAITING,
                     params=_params(run),
@@ -184,19 +186,10 @@ class Ledger:
     def recover(self) -> None:
         """End the trials of processes that have fallen silent, and enqueue what is missing then."""
         trials = self.trials()
-        now = time.monotonic()
-        lost = False
-        for trial in trials:
-            if trial.state is not TrialState.RUNNING:
-                continue
-            trial_id, beat = self._id(trial), trial.user_attrs.get(PROGRESS)
-            seen, since = self._heartbeats.get(trial_id, (None, now))
-            if trial_id not in self._heartbeats or seen != beat:
-                self._heartbeats[trial_id] = beat, now
-            elif now - since > self.grace:
-                self._end(trial_id, TrialState.FAIL, outcome="lost: its process fell silent")
-                lost = True
-        trials = self.trials() if lost else trials
+        silent = self._silence.find(trials)
+        for trial in silent:
+            self._end(self._id(trial), TrialState.FAIL, outcome="lost: its process fell silent")
+        trials = self.trials() if silent else trials
         self.enqueue_missing((Run(**trial.user_attrs[RUN]) for trial in trials), trials)
 
     def claim(self, worker: str) -> Claim | None:
@@ -215,15 +208,29 @@ class Ledger:
                     continue
             except UpdateFinishedTrialError:
                 continue
-            trials = self.trials()
-            key = trial.user_attrs[KEY]
-            if self._id(owned(trials)[key]) != trial_id:
+            # None: this process was away for so long that it was given up meanwhile
+            owner = owned(self.trials()).get(trial.user_attrs[KEY])
+            if owner is None or owner.number != trial.number:
                 self._end(trial_id, TrialState.FAIL, outcome="given up: the run has another trial")
                 continue
-            patiently(self.storage.set_trial_user_attr, trial_id, WORKER, worker)
-            seconds = sum(_seconds(each) for each in trials if each.user_attrs[KEY] == key)
-            return Claim(trial_id, Run(**trial.user_attrs[RUN]), seconds)
+            try:
+                patiently(self.storage.set_trial_user_attr, trial_id, WORKER, worker)
+            except UpdateFinishedTrialError:
+                continue
+            return Claim(trial_id, Run(**trial.user_attrs[RUN]))
         return None
+
+    def left(self) -> list[str]:
+        """
+        List the runs that are not over.
+
+        :return: their keys
+        """
+        trials = self.trials()
+        ended = {key for key, trial in owned(trials).items() if trial.state.is_finished()}
+        # Also trials that are not the run's own are ended before all is over
+        left = (trial for trial in trials if trial.user_attrs[KEY] not in ended or not trial.state.is_finished())
+        return list(dict.fromkeys(trial.user_attrs[KEY] for trial in left))
 
     def beat(self, claim: Claim, count: str, step: int, seconds: float) -> None:
         """
@@ -261,8 +268,12 @@ class Ledger:
 
         :param claim: the run
         :param value: mean return of the final model
+        :raises TrialLostError: if the trial is not this process's any more
         """
         self._end(claim.trial_id, TrialState.COMPLETE, value=value)
+        # It may be this process that has ended it, before its database's answer was lost
+        if patiently(self.storage.get_trial, claim.trial_id).state is not TrialState.COMPLETE:
+            raise TrialLostError(claim.run.key)
 
     def fail(self, claim: Claim, error: BaseException) -> None:
         """
@@ -311,6 +322,40 @@ class Ledger:
         for trial in trials:
             spent[trial.user_attrs[KEY]] += _seconds(trial)
         return [_record(experiment, trial, spent[key]) for key, trial in owned(trials).items() if trial.state.is_finished()]
+
+
+class Silence:
+    """
+    Finds trials whose processes have fallen silent.
+
+    :param grace: seconds of silence after which a process is taken for lost
+    :param clock: tells seconds
+    """
+
+    def __init__(self, grace: float, clock: Callable[[], float] = time.monotonic):
+        self._grace = grace
+        self._clock = clock
+        # By trial, the heartbeat that was seen last, and when it was first seen
+        self._seen: dict[int, tuple[Any, float]] = {}
+
+    def find(self, trials: Iterable[FrozenTrial]) -> list[FrozenTrial]:
+        """
+        Look at a study's trials.
+
+        :param trials: the trials
+        :return: those that run, and whose heartbeat has stood still since a look that is long ago
+        """
+        now = self._clock()
+        silent = []
+        for trial in trials:
+            if trial.state is TrialState.RUNNING:
+                beat = trial.user_attrs.get(PROGRESS)
+                seen, since = self._seen.setdefault(trial.number, (beat, now))
+                if seen != beat:
+                    self._seen[trial.number] = beat, now
+                elif now - since > self._grace:
+                    silent.append(trial)
+        return silent
 
 
 def is_open_or_ended(trial: FrozenTrial) -> bool:

@@ -115,7 +115,7 @@ def run(sweep: Sweep, study: str, args: argparse.Namespace, argv: Sequence[str])
         raise
     finally:
         folder = export_study(study, args.storage, args.results)
-    left = [trial for trial in ledger.trials() if not trial.state.is_finished()]
+    left = ledger.left()
     if left:
         codes = ", ".join(str(worker.returncode) for worker in workers)
         sys.exit(

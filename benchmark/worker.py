@@ -21,8 +21,8 @@ import torch as th
 from filelock import FileLock
 
 from benchmark.arguments import count
-from benchmark.run import run_folder, train
-from benchmark.storages import STORAGE_ERRORS, open_storage
+from benchmark.run import forget_states, run_folder, train
+from benchmark.storages import STORAGE_ERRORS, open_storage, patiently
 from benchmark.studies import Claim, Ledger, TrialLostError
 
 # Seconds between two heartbeats, and until a silent process is given up, by default
@@ -74,7 +74,7 @@ class Heart:
         while self._error is None:
             try:
                 self._ledger.beat(self._claim, f"{os.getpid()}-{beat}", self._step, time.monotonic() - self._start)
-            except (TrialLostError, *STORAGE_ERRORS) as error:
+            except Exception as error:
                 self._error = error
             if self._parent is not None and os.getppid() != self._parent:
                 os.kill(os.getpid(), signal.SIGTERM)
@@ -86,7 +86,7 @@ class Heart:
         if self._error is None:
             try:
                 self._ledger.beat(self._claim, f"{os.getpid()}-end", self._step, time.monotonic() - self._start)
-            except (TrialLostError, *STORAGE_ERRORS) as error:
+            except Exception as error:
                 self._error = error
 
 
@@ -107,7 +107,7 @@ def work(ledger: Ledger, logs: Path, name: str, beat: float = BEAT, parent: int 
         claim = ledger.claim(name)
         if claim is not None:
             _train_claimed(ledger, claim, logs, beat, parent, device)
-        elif all(trial.state.is_finished() for trial in ledger.trials()):
+        elif not ledger.left():
             return
         else:
             # Others' runs, or those of processes that have not been silent for long enough
@@ -129,6 +129,7 @@ def _train_claimed(ledger: Ledger, claim: Claim, logs: Path, beat: float, parent
         with Heart(ledger, claim, beat, parent) as heart, FileLock(folder / ".lock"):
             final = train(claim.run, folder, report, heart.watch, device)
         ledger.complete(claim, final)
+        forget_states(folder)
     except TrialLostError:
         print(f"{claim.run.key} was taken over by another process", flush=True)
     except (*STORAGE_ERRORS, OSError):
@@ -152,6 +153,10 @@ def terminate(number: int, frame: FrameType | None) -> None:
     :raises SystemExit: always
     """
     raise SystemExit(128 + number)
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    signal.raise_signal(signal.SIGTERM)
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -181,12 +186,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     args = parse(sys.argv[1:] if argv is None else argv)
     signal.signal(signal.SIGTERM, terminate)
-    # Ctrl-C in a terminal reaches all of its processes: this one's parent tells it to end
-    if args.parent is not None:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ctrl-C in a terminal reaches all of its processes: this one's parent tells it to end. Without one it is to give its run
+    # back: rl_zoo3 takes Ctrl-C for a training's end.
+    signal.signal(signal.SIGINT, _terminate if args.parent is None else signal.SIG_IGN)
     th.set_num_threads(args.threads)
     arguments: dict[str, Any] = dict(beat=args.beat, parent=args.parent, device=args.device)
-    ledger = Ledger(open_storage(args.storage), args.study, args.grace)
+    ledger = Ledger(patiently(open_storage, args.storage), args.study, args.grace)
     work(ledger, args.logs, f"{socket.gethostname()}:{os.getpid()}", **arguments)
 
 
