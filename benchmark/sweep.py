@@ -155,9 +155,14 @@ def hyperparameter(text: str) -> tuple[str, Any]:
     if not separator or not name.isidentifier():
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form name=value")
     try:
-        return name, yaml.safe_load(value)
+        read = yaml.safe_load(value)
     except yaml.YAMLError as error:
         raise argparse.ArgumentTypeError(f"{text!r} has a value that is no YAML: {error}") from error
+    try:
+        # YAML takes 1e-3 for a string
+        return name, float(read) if isinstance(read, str) else read
+    except ValueError:
+        return name, read
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
