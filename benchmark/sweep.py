@@ -21,6 +21,7 @@ import yaml
 from benchmark.arguments import count, output_folder
 from benchmark.experiments import Sweep, included_sweeps, load_sweep
 from benchmark.exports import ended_runs, export_study
+from benchmark.figures import figures, study_folders
 from benchmark.progress import Tally, display
 from benchmark.provenance import conditions
 from benchmark.storages import open_storage
@@ -260,9 +261,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.exit(f"Error: {error}")
     except KeyboardInterrupt:
         sys.exit(128 + signal.SIGINT)
-    from benchmark.figures import draw_figures
-
-    draw_figures(folders, args.results)
+    print(f"The page is {figures(sorted({*folders, *study_folders(args.results)}), args.results)}")
 
 
 if __name__ == "__main__":
