@@ -167,7 +167,7 @@ def stability_together(studies: Sequence[Study], repetitions: int = REPETITIONS)
     if len(largest) < 2:
         return []
     methods = list(dict.fromkeys(method for study in largest for method in study.methods))
-    caption = STABILITY.format(f"of all sweeps ({', '.join(study.name for study in largest)})")
+    caption = STABILITY.format(f"of all sweeps ({', '.join(study.name for study in largest)}) that name the method")
     return [Picture("figures/stability.png", caption, stability(score_table(largest), methods, repetitions))]
 
 
@@ -201,7 +201,7 @@ def find(study: str, storage: str | None, out: Path) -> Path:
     :param storage: the storage
     :param out: where its folder is made
     :return: its folder
-    :raises FileNotFoundError: if there is no such folder, nor such a study in a storage that was named
+    :raises FileNotFoundError: if there is no such folder, and no storage was named or it has no such study
     """
     if storage is None:
         for folder in (Path(study), out / study):
@@ -214,7 +214,7 @@ def find(study: str, storage: str | None, out: Path) -> Path:
     try:
         return export_study(study, storage, out)
     except KeyError as error:
-        raise FileNotFoundError(f"There is no study {study!r} in {storage}") from error
+        raise FileNotFoundError(f"The storage {storage} holds no study {study}") from error
 
 
 if __name__ == "__main__":

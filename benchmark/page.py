@@ -75,6 +75,8 @@ def study_section(study: Study, pictures: Sequence[Picture], command: str, repet
         f"{facts['settings_in_words']}\n\nSeeds {', '.join(map(str, facts['seeds']))}; {facts['steps']:,} steps, evaluated "
         f"every {facts['evaluation_interval']:,} by {facts['evaluation_episodes']} episodes.",
         f"The runs: {conditions_in_words(facts)}",
+        # Of a study that was gone on with
+        *(f"Earlier runs: {conditions_in_words(earlier)}" for earlier in facts.get("earlier", [])),
     ]
     if study.records:
         parts += [picture.in_words(command) for picture in pictures]

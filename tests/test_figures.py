@@ -1,7 +1,9 @@
 """``python -m benchmark.figures``: which figures studies get, what the page says, and that both repeat."""
 
 import shlex
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -87,7 +89,7 @@ def test_page_names_sweeps_runs_and_failures(folder: Path) -> None:
     assert "- TD3: `ValueError: NaN` (1 run)" in text
     assert "counts with the lowest return that any evaluation" in text
     assert "My-PPO" in text
-    assert "of all sweeps (axes, axis)" in text
+    assert "of all sweeps (axes, axis) that name the method" in text
     # TD3's failed run counts as the lowest return of the task, -1000
     row = next(line for line in text.splitlines() if line.startswith("| Pendulum-v1 | learning rate 0.01 | TD3 |"))
     assert row.endswith("| -474.0 | -1000.0 | -297.0 | 4 | 1 |")
@@ -154,6 +156,21 @@ def test_mistakes_are_named(folder: Path, tmp_path: Path, capsys: pytest.Capture
     with pytest.raises(SystemExit):
         main([str(folder / "axis"), "--repetitions", "0", "--folder", str(tmp_path)])
     assert "'0' is not an integer >= 1" in capsys.readouterr().err
+
+
+def test_named_study_is_taken_from_its_storage(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def export_study(name: str, storage: str, results: Path) -> Path:
+        assert storage == "sqlite:///studies.db"
+        if name != "mine":
+            raise KeyError(name)
+        return write_study(results / name, runs(score, BASELINES, GRID[:2]))
+
+    monkeypatch.setitem(sys.modules, "benchmark.exports", SimpleNamespace(export_study=export_study))
+    options = ["--storage", "sqlite:///studies.db", "--folder", str(tmp_path), "--repetitions", "20"]
+    main(["mine", *options])
+    assert "The study mine" in (tmp_path / "results.md").read_text()
+    with pytest.raises(SystemExit, match=r"The storage sqlite:///studies\.db holds no study yours"):
+        main(["yours", *options])
 
 
 def test_default_folder_is_left_out_of_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
