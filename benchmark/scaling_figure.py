@@ -7,6 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
+from benchmark.style import METHODS
+
 AXIS_TITLES = {
     "cem_iterations": "CEM iterations",
     "cem_samples": "CEM samples",
@@ -20,11 +22,7 @@ QUANTITIES = {
     "gradient_step_seconds": ("ms per gradient step", 1e3),
     "env_steps_per_second": ("environment steps per second", 1.0),
 }
-# Two of the Okabe-Ito palette's colours; markers and lines tell them apart without any
-STYLES: dict[str, dict[str, Any]] = {
-    "CGP": dict(color="#0072B2", marker="o", linestyle="-"),
-    "TD3": dict(color="#D55E00", marker="s", linestyle="--"),
-}
+STYLES = {"CGP": METHODS["CGP-Online"], "TD3": METHODS["TD3"]}
 COLUMNS = 4
 
 

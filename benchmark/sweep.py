@@ -21,6 +21,7 @@ import yaml
 from benchmark.arguments import count, output_folder
 from benchmark.experiments import Sweep, included_sweeps, load_sweep
 from benchmark.exports import ended_runs, export_study
+from benchmark.figures import figures, study_folders
 from benchmark.progress import Tally, display
 from benchmark.provenance import conditions
 from benchmark.storages import open_storage
@@ -155,9 +156,14 @@ def hyperparameter(text: str) -> tuple[str, Any]:
     if not separator or not name.isidentifier():
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form name=value")
     try:
-        return name, yaml.safe_load(value)
+        read = yaml.safe_load(value)
     except yaml.YAMLError as error:
         raise argparse.ArgumentTypeError(f"{text!r} has a value that is no YAML: {error}") from error
+    try:
+        # YAML takes 1e-3 for a string
+        return name, float(read) if isinstance(read, str) else read
+    except ValueError:
+        return name, read
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -255,9 +261,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.exit(f"Error: {error}")
     except KeyboardInterrupt:
         sys.exit(128 + signal.SIGINT)
-    from benchmark.figures import draw_figures
-
-    draw_figures(folders, args.results)
+    print(f"The page is {figures(sorted({*folders, *study_folders(args.results)}), args.results)}")
 
 
 if __name__ == "__main__":

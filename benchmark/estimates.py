@@ -1,0 +1,204 @@
+"""Estimates with bootstrap intervals, by rliable: every statistic of the results page."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from rliable.library import StratifiedIndependentBootstrap
+from scipy import stats
+
+# Of draws of runs at once: a call of SciPy for each would take most of the time
+Statistic = Callable[..., np.ndarray]
+
+REPETITIONS = 2_000
+# Fewer runs on either side of a comparison decide nothing: even if none overlap, chance alone does so in one case of twenty
+FEWEST_RUNS = 4
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """
+    A number that was estimated from runs.
+
+    :param value: the estimate
+    :param interval: its 95 % interval; None where a configuration has one run only
+    :param runs: how many runs the smallest of the compared groups has
+    """
+
+    value: float
+    interval: tuple[float, float] | None
+    runs: int
+
+    def in_words(self, form: str = ".2f") -> str:
+        """
+        Write the number and its interval.
+
+        :param form: the numbers' format
+        :return: such as "0.52 (0.40 to 0.61)"
+        """
+        if self.interval is None:
+            return f"{self.value:{form}} (no interval)"
+        low, high = self.interval
+        return f"{self.value:{form}} ({low:{form}} to {high:{form}})"
+
+
+def bootstrap(
+    statistic: Statistic, groups: Sequence[Sequence[np.ndarray]], repetitions: int = REPETITIONS
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """
+    Estimate a statistic of groups of runs, drawing runs within each cell (a task and a configuration), not across cells.
+
+    :param statistic: takes an array per group, (R, N, ...), of R draws of its N runs in any order, and returns (R, ...)
+    :param groups: each group's cells, of shape (runs, ...)
+    :param repetitions: how often runs are drawn, R
+    :return: the statistic (...), and its 95 % interval (2, ...); None where a cell has one run only, which shows no spread
+    """
+    value = statistic(*(np.concatenate(cells)[None] for cells in groups))[0]
+    if any(len(cell) < 2 for cells in groups for cell in cells):
+        return value, None
+    # rliable draws within columns: cells of one size are the columns of one array
+    arrays, owners = [], []
+    for owner, cells in enumerate(groups):
+        for size in sorted({len(cell) for cell in cells}):
+            arrays.append(np.stack([cell for cell in cells if len(cell) == size], axis=1))
+            owners.append(owner)
+    # rliable ignores its random_state and draws from NumPy's global generator
+    state = np.random.get_state()  # noqa: NPY002
+    np.random.seed(0)  # noqa: NPY002
+    try:
+        draws = [drawn for drawn, _ in StratifiedIndependentBootstrap(*arrays).bootstrap(repetitions)]
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+    drawn = [
+        np.stack(each).reshape(repetitions, -1, *array.shape[2:])
+        for each, array in zip(zip(*draws, strict=True), arrays, strict=True)
+    ]
+    pooled = (
+        np.concatenate([each for each, owner in zip(drawn, owners, strict=True) if owner == group], axis=1)
+        for group in range(len(groups))
+    )
+    return value, np.percentile(statistic(*pooled), [2.5, 97.5], axis=0)
+
+
+def estimate(statistic: Statistic, groups: Sequence[Sequence[np.ndarray]], repetitions: int = REPETITIONS) -> Estimate:
+    """
+    Estimate one number, as :func:`bootstrap` does.
+
+    :param statistic: takes an array per group, (R, N), and returns the number of each draw (R)
+    :param groups: each group's cells
+    :param repetitions: how often runs are drawn
+    :return: the estimate
+    """
+    value, interval = bootstrap(statistic, groups, repetitions)
+    runs = min(sum(len(cell) for cell in cells) for cells in groups)
+    return Estimate(float(value), None if interval is None else (float(interval[0]), float(interval[1])), runs)
+
+
+def cells_of(table: pd.DataFrame, column: str) -> list[np.ndarray]:
+    """
+    Split runs of one method into cells.
+
+    :param table: the runs' scores
+    :param column: the column wanted
+    :return: an array of each cell's runs
+    """
+    return [cell.to_numpy(dtype=float) for _, cell in table.groupby("cell", sort=True)[column]]
+
+
+def in_common(table: pd.DataFrame, methods: Sequence[str]) -> pd.DataFrame:
+    """
+    Keep the runs of methods in the cells that all of them have.
+
+    :param table: the runs' scores
+    :param methods: the methods
+    :return: their runs there; none if one method has no cell with the others
+    """
+    chosen = table[table["method"].isin(methods)]
+    return chosen[chosen.groupby("cell")["method"].transform("nunique") == len(methods)]
+
+
+def compare(
+    table: pd.DataFrame, methods: Sequence[str], statistic: Statistic, column: str = "share", repetitions: int = REPETITIONS
+) -> Estimate | None:
+    """
+    Compare methods on the tasks and configurations that all of them ran.
+
+    :param table: the runs' scores
+    :param methods: the methods
+    :param statistic: takes an array per method, (R, N), of a task's runs, and returns numbers (R), whose mean over tasks is
+        estimated
+    :param column: which scores it takes
+    :param repetitions: how often runs are drawn
+    :return: the estimate; None if the methods have no configuration in common
+    """
+    common = in_common(table, methods)
+    tasks = list(dict.fromkeys(common["task"]))
+    if not tasks:
+        return None
+    groups = []
+    for task in tasks:
+        runs = common[common["task"] == task]
+        groups += [cells_of(runs[runs["method"] == method], column) for method in methods]
+
+    def mean_over_tasks(*pooled: np.ndarray) -> np.ndarray:
+        width = len(methods)
+        return np.mean([statistic(*pooled[start : start + width]) for start in range(0, len(pooled), width)], axis=0)
+
+    return estimate(mean_over_tasks, groups, repetitions)
+
+
+def interquartile_mean(scores: np.ndarray) -> np.ndarray:
+    """
+    Average the middle half, as rliable does.
+
+    :param scores: runs (R, N, ...)
+    :return: the mean without the lowest and the highest quarter (R, ...)
+    """
+    return stats.trim_mean(scores, 0.25, axis=1)
+
+
+def share_reaching(scores: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """
+    Count the runs that reach each level: the stability curve, a performance profile.
+
+    :param scores: runs (R, N)
+    :param levels: the levels (K)
+    :return: the share that scores at least so much (R, K)
+    """
+    below = [np.searchsorted(each, levels) for each in np.sort(scores, axis=1)]
+    return 1 - np.array(below) / scores.shape[1]
+
+
+def probability_of_improvement(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """
+    Estimate how often a run of ours scores more than one of theirs, as rliable does: by the Mann-Whitney statistic.
+
+    :param ours: our runs (R, N)
+    :param theirs: their runs (R, M)
+    :return: the probability, ties counted as half (R)
+    """
+    # The statistic does not depend on the method, which is that of the p-value
+    wins = stats.mannwhitneyu(ours, theirs, axis=1, method="asymptotic").statistic
+    return wins / (ours.shape[1] * theirs.shape[1])
+
+
+def difference(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """
+    Compare interquartile means.
+
+    :param ours: our runs (R, N)
+    :param theirs: their runs (R, M)
+    :return: ours less theirs (R)
+    """
+    return interquartile_mean(ours) - interquartile_mean(theirs)
+
+
+def spread(scores: np.ndarray) -> np.ndarray:
+    """
+    Measure how far runs scatter.
+
+    :param scores: runs (R, N)
+    :return: the interquartile range (R)
+    """
+    return stats.iqr(scores, axis=1)

@@ -1,0 +1,73 @@
+"""Studies whose truth is known, for the tests of figures, statistics and claims."""
+
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import torch as th
+
+from benchmark.provenance import conditions
+from benchmark.records import Record, write_records
+
+STEPS, INTERVAL = 1_000, 250
+SWEEP = "benchmark.sweep"
+
+
+def record(
+    method: str,
+    seed: int,
+    final: float | None,
+    task: str = "Pendulum-v1",
+    settings: dict[str, Any] | None = None,
+    returns: list[float] | None = None,
+    steps: int = STEPS,
+) -> Record:
+    """A run whose evaluations all were its final one, unless said otherwise."""
+    returns = [-1_000.0 if final is None else final] * (steps // INTERVAL) if returns is None else returns
+    timesteps = [INTERVAL * (number + 1) for number in range(len(returns))]
+    error = "ValueError: NaN" if final is None else None
+    return Record("sweep", method, task, settings or {}, seed, steps, timesteps, returns, final, error, 1.0)
+
+
+def runs(
+    score: Callable[[str, dict[str, Any], int], float | None],
+    methods: Iterable[str],
+    configurations: Iterable[dict[str, Any]] = ({},),
+    seeds: Iterable[int] = range(4),
+    tasks: Iterable[str] = ("Pendulum-v1",),
+) -> list[Record]:
+    """All runs of a grid, each scored by its method, its configuration and its seed."""
+    return [
+        record(method, seed, score(method, settings, seed), task, settings)
+        for method in methods
+        for task in tasks
+        for settings in configurations
+        for seed in seeds
+    ]
+
+
+def write_study(folder: Path, records: list[Record], planned: int | None = None) -> Path:
+    """Write a study's folder as a sweep exports it."""
+    axes: dict[str, list[Any]] = {}
+    for run in records:
+        for axis, value in run.settings.items():
+            axes.setdefault(axis, [])
+            axes[axis] += [value] * (value not in axes[axis])
+    facts = {
+        "title": f"The study {folder.name}",
+        "experiment": folder.name,
+        "axes": axes,
+        "methods": list(dict.fromkeys(run.method for run in records)),
+        "tasks": list(dict.fromkeys(run.task for run in records)),
+        "seeds": sorted({run.seed for run in records}),
+        "steps": STEPS,
+        "evaluation_interval": INTERVAL,
+        "evaluation_episodes": 5,
+        "settings_in_words": "Hidden width 64.",
+        "runs_planned": len(records) if planned is None else planned,
+        **conditions(SWEEP, [folder.name], th.device("cpu")),
+    }
+    write_records(folder, records)
+    (folder / "study.json").write_text(json.dumps(facts))
+    return folder

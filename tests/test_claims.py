@@ -1,0 +1,191 @@
+"""The verdicts on the paper's claims, on runs whose truth is known."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from finished_studies import record, runs, write_study
+
+from benchmark.claims import CONTRADICTED, NO_DATA, NOT_DECIDED, SUPPORTED, Finding, findings
+from benchmark.records import Record
+from benchmark.scores import read_study, score_table
+
+SWEPT = [{"width": 32}, {"width": 64}]
+VARIANTS = ["CGP-Online", "CGP-Offline", "QGP-Online", "QGP-Offline"]
+
+
+@pytest.fixture
+def find(tmp_path: Path) -> Any:
+    """Test a claim, named by a part of its text, on runs, and on a random one from 0 to 100, so that rewards are percents."""
+
+    def finding(part: str, records: list[Record], runtime: dict[str, Any] | None = None) -> Finding:
+        scale = [record("Random", 99, 100.0, task, returns=[0.0]) for task in {run.task for run in records}]
+        table = score_table([read_study(write_study(tmp_path / "sweep", records + scale))])
+        (found,) = (each for each in findings(table, runtime, repetitions=200) if part in each.claim)
+        return found
+
+    return finding
+
+
+def scores(**levels: float) -> Any:
+    """Score each method at its level, seeds one apart."""
+    by_name = {name.replace("_", "-"): level for name, level in levels.items()}
+    return lambda method, settings, seed: by_name[method] + seed
+
+
+def test_nothing_is_said_without_data(tmp_path: Path) -> None:
+    table = score_table([read_study(write_study(tmp_path / "sweep", []))])
+    assert isinstance(table, pd.DataFrame)
+    found = findings(table, None, repetitions=10)
+    assert len(found) == 9
+    assert {each.verdict for each in found} == {NO_DATA}
+    assert {each.text for each in found} == {""}
+
+
+def test_foreign_methods_alone_say_nothing(find: Any) -> None:
+    records = runs(scores(PPO=50, A2C=40), ["PPO", "A2C"])
+    assert find("best or second", records).verdict == NO_DATA
+
+
+@pytest.mark.parametrize(
+    ("levels", "verdict"),
+    [
+        (dict(CGP_Online=80, TD3=40, SAC=90, DDPG=20), SUPPORTED),
+        (dict(CGP_Online=30, TD3=40, SAC=90, DDPG=20), CONTRADICTED),
+        (dict(CGP_Online=40, TD3=40, SAC=90, DDPG=20), NOT_DECIDED),
+    ],
+)
+def test_best_or_second(find: Any, levels: dict[str, float], verdict: str) -> None:
+    methods = [name.replace("_", "-") for name in levels]
+    found = find("best or second", runs(scores(**levels), methods))
+    assert found.verdict == verdict
+
+
+def test_best_or_second_must_hold_on_every_task(find: Any) -> None:
+    methods = ["CGP-Online", "TD3", "SAC"]
+    good = runs(scores(CGP_Online=80, TD3=40, SAC=20), methods, tasks=["Pendulum-v1"])
+    bad = runs(scores(CGP_Online=20, TD3=40, SAC=80), methods, tasks=["Reacher-v5"])
+    found = find("best or second", good + bad)
+    assert found.verdict == CONTRADICTED
+    assert "1 of 3 on Pendulum-v1" in found.text
+    assert "3 of 3 on Reacher-v5" in found.text
+
+
+def test_own_variants_and_random_actions_are_no_rivals(find: Any) -> None:
+    levels = dict(CGP_Online=60, CGP_Offline=90, QGP_Online=80, CEM=85, TD3=50, SAC=40, Random=99)
+    found = find("best or second", runs(scores(**levels), [name.replace("_", "-") for name in levels]))
+    assert found.verdict == SUPPORTED
+    assert "rank 1 of 3" in found.text
+
+
+@pytest.mark.parametrize(("ours", "theirs", "verdict"), [(1, 20, SUPPORTED), (20, 1, CONTRADICTED), (5, 5, NOT_DECIDED)])
+def test_narrower_spread(find: Any, ours: float, theirs: float, verdict: str) -> None:
+    width = {"CGP-Online": ours, "TD3": theirs, "SAC": theirs}
+    records = runs(lambda method, _, seed: 50 + width[method] * (seed - 3.5) / 3.5, width, SWEPT, seeds=range(8))
+    found = find("narrower", records)
+    assert found.verdict == verdict
+    assert "TD3" in found.text
+    assert "SAC" in found.text
+    assert "DDPG" not in found.text
+
+
+def test_one_wider_baseline_is_not_enough(find: Any) -> None:
+    width = {"CGP-Online": 3.0, "TD3": 10.0, "SAC": 0.1}
+    found = find("narrower", runs(lambda method, _, seed: 10 + width[method] * seed, width, SWEPT, seeds=range(9)))
+    assert [part.verdict for part in found.parts] == [SUPPORTED, CONTRADICTED]
+    assert found.verdict == CONTRADICTED
+
+
+def test_high_learning_rates_are_left_out_of_the_spread(find: Any) -> None:
+    rates = [{"learning_rate": rate} for rate in (1e-4, 1e-3, 1e-2, 3e-2)]
+
+    def score(method: str, settings: dict[str, Any], seed: int) -> float:
+        if method == "CGP-Online":
+            return 80.0 + seed if settings["learning_rate"] < 1e-2 else 0.0
+        return 50.0 + 10 * seed
+
+    found = find("narrower", runs(score, ["CGP-Online", "TD3"], rates))
+    assert found.verdict == SUPPORTED
+    assert "with learning rates from 0.01 on" in found.text
+
+
+@pytest.mark.parametrize(("ours", "verdict"), [(80.0, SUPPORTED), (60.0, SUPPORTED), (30.0, CONTRADICTED)])
+def test_actor_against_cem(find: Any, ours: float, verdict: str) -> None:
+    assert find("imitates", runs(scores(CGP_Online=ours, CEM=60), ["CGP-Online", "CEM"])).verdict == verdict
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(1.0, SUPPORTED), (1.5, CONTRADICTED), (0.5, CONTRADICTED)])
+def test_inference_cost(find: Any, factor: float, verdict: str) -> None:
+    # Rounds differ far more than methods within a round
+    rounds = np.array([1.0, 3.0, 2.0, 1.5, 2.5, 8.0])
+    timed = {"CGP-2": rounds, "CGP-4": factor * rounds, "CEM-2": 3 * rounds, "CEM-4": 6 * rounds, "CGP-2-plain": rounds}
+    runtime = {"methods": {name: {"inference": {"seconds": {"all": list(all_)}}} for name, all_ in timed.items()}}
+    runtime["methods"]["SBX"] = {"missing": "not installed"}
+    found = find("inference cost", [], runtime)
+    assert found.verdict == verdict
+    assert f"after 4 iterations takes {factor:.2f}" in found.text
+    assert "CEM itself 2.00 times" in found.text
+
+
+@pytest.mark.parametrize(
+    ("axis", "values", "claim"),
+    [("learning_rate", (1e-2, 1e-3, 1e-4), "learning rate of 0.01"), ("learning_starts", (0, 1_000, 10_000), "few initial")],
+)
+@pytest.mark.parametrize(("poor", "verdict"), [(10.0, SUPPORTED), (78.0, CONTRADICTED)])
+def test_failing_settings(find: Any, axis: str, values: tuple[float, ...], claim: str, poor: float, verdict: str) -> None:
+    bad = {1e-2, 0, 1_000}
+
+    def score(method: str, settings: dict[str, Any], seed: int) -> float:
+        return (poor if settings[axis] in bad else 80.0) + seed
+
+    found = find(claim, runs(score, ["CGP-Online", "TD3"], [{axis: value} for value in values]))
+    assert found.verdict == verdict
+    assert ("0 of" in found.text) == (verdict == CONTRADICTED)
+
+
+def test_crashes_at_a_high_rate_count(find: Any) -> None:
+    def score(method: str, settings: dict[str, Any], seed: int) -> float | None:
+        return None if settings["learning_rate"] == 1e-2 else 80.0 + seed
+
+    records = runs(score, ["CGP-Online"], [{"learning_rate": rate} for rate in (1e-2, 1e-3)])
+    assert find("learning rate of 0.01", records).verdict == SUPPORTED
+
+
+def test_schedules_are_no_high_rates(find: Any) -> None:
+    records = runs(scores(CGP_Online=50), ["CGP-Online"], [{"learning_rate": "lin_1e-2"}, {"learning_rate": 1e-3}])
+    assert find("learning rate of 0.01", records).verdict == NO_DATA
+
+
+def test_variants(find: Any) -> None:
+    good, poor = [80.0] * 12, [20.0] * 3 + [80.0] * 9
+    tables = {"CGP-Online": good, "CGP-Offline": poor, "QGP-Online": poor, "QGP-Offline": poor}
+    records = runs(lambda method, _, seed: tables[method][seed] + 0.1 * seed, VARIANTS, SWEPT, seeds=range(12))
+    assert find("upper quartiles", records).verdict == SUPPORTED
+    assert find("bottom quartile", records).verdict == SUPPORTED
+
+    tables |= {"CGP-Online": poor, "QGP-Online": good, "CGP-Offline": [40.0] * 12}
+    records = runs(lambda method, _, seed: tables[method][seed] + 0.1 * seed, VARIANTS, SWEPT, seeds=range(12))
+    assert find("upper quartiles", records).verdict == CONTRADICTED
+    assert find("bottom quartile", records).verdict == CONTRADICTED
+
+
+@pytest.mark.parametrize(
+    ("levels", "verdict"),
+    [
+        (dict(CGP_Online=60, CGP_Offline=50, QGP_Online=55, QGP_Offline=40), SUPPORTED),
+        (dict(CGP_Online=60, CGP_Offline=50, QGP_Online=40, QGP_Offline=55), CONTRADICTED),
+        (dict(CGP_Online=60, CGP_Offline=50, QGP_Online=40, QGP_Offline=40), NOT_DECIDED),
+    ],
+)
+def test_online_against_offline(find: Any, levels: dict[str, float], verdict: str) -> None:
+    assert find("online training", runs(scores(**levels), VARIANTS)).verdict == verdict
+
+
+@pytest.mark.parametrize("seeds", [1, 2, 3])
+def test_few_seeds_decide_nothing(find: Any, seeds: int) -> None:
+    records = runs(scores(CGP_Online=80, CEM=10), ["CGP-Online", "CEM"], seeds=range(seeds))
+    found = find("imitates", records)
+    assert found.verdict == NOT_DECIDED
+    assert ("no interval" in found.text) == (seeds == 1)

@@ -1,0 +1,145 @@
+"""The command that runs sweeps: its arguments, what it exports and adopts, and how far it says it is."""
+
+import json
+
+import pytest
+from optuna.trial import TrialState, create_trial
+
+from benchmark.experiments import load_sweep
+from benchmark.exports import ended_runs, export_study
+from benchmark.progress import Tally
+from benchmark.records import Record, read_records, write_records
+from benchmark.storages import open_storage
+from benchmark.studies import ERROR, KEY, PROGRESS, Ledger
+from benchmark.sweep import describe, hyperparameter, load, main, parse, study_name
+from benchmark.sweep_files import SweepError
+
+SMALL = ["e8", "--task", "Pendulum-v1", "--steps", "400", "--seeds", "1", "--methods", "TD3"]
+
+
+def of_command_line(*argv):
+    args = parse(argv)
+    return load(args.name, args), args
+
+
+def test_options_replace_what_the_file_says(tmp_path):
+    sweep, args = of_command_line(
+        *SMALL, "--set", "gamma=0.9", "policy_kwargs=dict(net_arch=[8, 8])", "learning_rate=1e-2", "--results", str(tmp_path)
+    )
+    runs = sweep.runs()
+    assert len(runs) == 2
+    assert {(run.method, run.task, run.steps, run.evaluation_interval, run.seed) for run in runs} == {
+        ("TD3", "Pendulum-v1", 400, 20, 0)
+    }
+    for run in runs:
+        assert (run.hyperparams["gamma"], run.hyperparams["learning_rate"]) == (0.9, 0.01)
+        assert run.hyperparams["policy_kwargs"] == "dict(net_arch=[8, 8])"
+    assert study_name(sweep, args) == "e8-Pendulum-v1"
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("a=1", 1), ("a=1e-3", 0.001), ("a=[1, x]", [1, "x"]), ("a=null", None), ("a=step", "step")]
+)
+def test_a_hyperparameter_is_read_as_yaml_files_are(text, value):
+    assert hyperparameter(text) == ("a", value)
+
+
+def test_mistakes_end_the_command_with_what_is_allowed(tmp_path):
+    common = ["--results", str(tmp_path), "--storage", f"sqlite:///{tmp_path}/studies.db"]
+    for argv, words in [
+        (["e9"], "must be one of e1"),
+        (["e3", "--task", "Pendulum-v7"], "Pendulum-v1"),
+        (["e3", "--methods", "SAC"], "CGP-Online"),
+        (["e3", "--set", "gama=1"], "gamma"),
+        (["e2", "--study", "mine"], "is 5 sweeps"),
+        (["e3", "--storage", "nonsense"], "storage"),
+        (["e3", "--storage", "grpc://localhost"], "port"),
+    ]:
+        with pytest.raises(SystemExit) as error:
+            main([argv[0], *common, *argv[1:]])
+        assert words in str(error.value)
+
+
+@pytest.fixture
+def ledger(tmp_path):
+    """A study that is enqueued, of two runs."""
+    sweep, _ = of_command_line(*SMALL, "--results", str(tmp_path / "results"))
+    ledger = Ledger(open_storage(f"sqlite:///{tmp_path}/studies.db"), "mine")
+    ledger.open(sweep, describe(sweep, SMALL, "cpu") | {"earlier": []})
+    return ledger
+
+
+def test_an_exported_study_is_adopted_by_another(tmp_path, ledger):
+    first = ledger.claim("w")
+    ledger.beat(first, "1", 400, 12.0)
+    for step, value in ((20, -5.0), (40, -4.0)):
+        ledger.report(first, step, value)
+    ledger.complete(first, -3.0)
+    second = ledger.claim("w")
+    ledger.fail(second, ValueError("a NaN"))
+    folder = export_study("mine", f"sqlite:///{tmp_path}/studies.db", tmp_path / "results")
+    records = read_records(folder)
+    assert {record.error for record in records} == {None, "ValueError: a NaN"}
+    (done,) = (record for record in records if record.error is None)
+    assert (done.timesteps, done.returns, done.final, done.seconds) == ([20, 40], [-5.0, -4.0], -3.0, 12.0)
+
+    sweep, _ = of_command_line(*SMALL[:-4], "--seeds", "2", "--methods", "TD3", "--results", str(tmp_path / "results"))
+    description = describe(sweep, [], "cpu")
+    ended, earlier = ended_runs(folder, description)
+    assert earlier[0]["command"].startswith("python -m benchmark.sweep e8")
+    other = Ledger(open_storage(f"sqlite:///{tmp_path}/other.db"), "mine")
+    other.open(sweep, description | {"earlier": earlier}, ended)
+    assert sorted(map(str, other.records())) == sorted(map(str, records))
+    waiting = [trial.user_attrs[KEY] for trial in other.trials() if trial.state is TrialState.WAITING]
+    assert len(waiting) == 2
+    assert all(key.endswith("seed=1") for key in waiting)
+    # Once
+    other.open(sweep, description, ended)
+    assert len(other.trials()) == 4
+
+
+def test_runs_of_other_settings_are_not_adopted(tmp_path, ledger):
+    folder = export_study("mine", f"sqlite:///{tmp_path}/studies.db", tmp_path / "results")
+    for option, key in ((["--steps", "401"], "steps"), (["--set", "gamma=0.5"], "configurations")):
+        sweep, _ = of_command_line(*SMALL, *option, "--eval-interval", "20", "--results", str(tmp_path))
+        with pytest.raises(SweepError, match=key):
+            ended_runs(folder, describe(sweep, [], "cpu"))
+    assert ended_runs(tmp_path / "nothing", {}) == ([], [])
+
+
+def test_records_come_back(tmp_path):
+    records = [
+        Record("e3", "A", "Pendulum-v1", {"x": 0.5, "y": "z"}, 3, 10, [5, 10], [1.5, 2.0], 2.5, None, 1.0),
+        Record("e3", "B", "Pendulum-v1", {}, 0, 10, [], [], None, "ValueError: NaN", None),
+    ]
+    write_records(tmp_path, records)
+    assert sorted(read_records(tmp_path), key=str) == sorted(records, key=str)
+
+
+def trial_of(key, state, step=0, **attributes):
+    value = 0.0 if state is TrialState.COMPLETE else None
+    attributes = {KEY: key, PROGRESS: {"step": step}} | attributes
+    return create_trial(state=state, value=value, user_attrs=attributes)
+
+
+def test_progress_counts_runs_and_measures_the_speed():
+    tally = Tally(steps=100)
+    waiting, done = trial_of("c", TrialState.WAITING), trial_of("a", TrialState.COMPLETE, 100)
+    failed = trial_of("d", TrialState.FAIL, 30, **{ERROR: "NaN"})
+    lost = trial_of("b", TrialState.FAIL, 80)
+    first = tally.look([lost, trial_of("b", TrialState.RUNNING, 20), waiting, done, failed], now=0.0)
+    assert (first.runs, first.done, first.running, first.failed) == (4, 1, 1, 1)
+    assert first.share == pytest.approx((100 + 100 + 20) / 400)
+    assert first.speed is None
+    second = tally.look([trial_of("b", TrialState.RUNNING, 60), waiting, done, failed], now=10.0)
+    assert second.speed == pytest.approx(4.0)
+    assert second.seconds_left == pytest.approx((400 - 260) / 4)
+    assert "1 of 4 runs done, 1 running, 1 failed, 4 steps/s, 0:00:35 left" in str(second)
+
+
+def test_the_description_is_plain_data_and_names_each_configuration():
+    sweep = load_sweep("e3")
+    description = describe(sweep, [], "cpu")
+    assert json.loads(json.dumps(description)) == description
+    assert set(description["configurations"]) == {run.configuration for run in sweep.runs()}
+    assert description["runs_planned"] == 96
