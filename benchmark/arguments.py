@@ -3,9 +3,11 @@
 import argparse
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import torch as th
+import yaml
 from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
@@ -58,6 +60,28 @@ def continuous_environment(text: str) -> str:
     if not isinstance(env.action_space, spaces.Box):
         raise argparse.ArgumentTypeError(f"{text!r} has no continuous actions, but {env.action_space}")
     return text
+
+
+def hyperparameter(text: str) -> tuple[str, Any]:
+    """
+    Read a hyperparameter, as in ``learning_starts=500``.
+
+    :param text: the argument
+    :return: its name and value
+    :raises argparse.ArgumentTypeError: if it is not of that form
+    """
+    name, separator, value = text.partition("=")
+    if not separator or not name.isidentifier():
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form name=value")
+    try:
+        read = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} has a value that is no YAML: {error}") from error
+    try:
+        # YAML takes 1e-3 for a string
+        return name, float(read) if isinstance(read, str) else read
+    except ValueError:
+        return name, read
 
 
 def output_folder(text: str) -> Path:

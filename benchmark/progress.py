@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from optuna.trial import FrozenTrial, TrialState
 from rich.progress import BarColumn, Progress, TextColumn
 
-from benchmark.silence import PROGRESS
+from benchmark.heartbeats import PROGRESS
 from benchmark.studies import ERROR, owned
 
 # Seconds over which the speed is measured, and between two lines where there is no terminal

@@ -17,6 +17,7 @@ Result = TypeVar("Result")
 
 # What says that the database, and not the call, is at fault. Optuna lets some of SQLAlchemy's errors through.
 STORAGE_ERRORS = (optuna.exceptions.StorageInternalError, SQLAlchemyError, grpc.RpcError, ConnectionError)
+DEFAULT_STORAGE = "sqlite:///logs/sweeps/studies.db"
 # Seconds that SQLite waits for another process's writing
 SQLITE_TIMEOUT = 120
 # Seconds of patience with other processes that are making the same tables

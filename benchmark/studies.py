@@ -30,8 +30,8 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from benchmark.experiments import Run, Sweep, run_key
+from benchmark.heartbeats import PROGRESS, Silence, TrialLostError, send_beat
 from benchmark.records import Record
-from benchmark.silence import PROGRESS, Silence
 from benchmark.storages import patiently
 from benchmark.sweep_files import SweepError
 
@@ -39,10 +39,6 @@ from benchmark.sweep_files import SweepError
 SWEEP = "sweep"
 # Attributes of a trial
 RUN, KEY, ERROR, WORKER, OUTCOME = "run", "key", "error", "worker", "outcome"
-
-
-class TrialLostError(RuntimeError):
-    """This process was given up by another: the trial is not its own any more."""
 
 
 @dataclass(frozen=True)
@@ -243,11 +239,7 @@ class Ledger:
         :param seconds: what this attempt has taken so far
         :raises TrialLostError: if the trial is not this process's any more
         """
-        progress = {"beat": count, "step": step, "seconds": round(seconds, 1)}
-        try:
-            patiently(self.storage.set_trial_user_attr, claim.trial_id, PROGRESS, progress)
-        except UpdateFinishedTrialError as error:
-            raise TrialLostError(claim.run.key) from error
+        send_beat(self.storage, claim.trial_id, count, step, seconds)
 
     def report(self, claim: Claim, step: int, value: float) -> None:
         """

@@ -8,7 +8,6 @@ the same ``--storage``, takes up what is not finished. At the end it exports the
 import argparse
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -16,20 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import torch as th
-import yaml
 
-from benchmark.arguments import count, output_folder
+from benchmark.arguments import count, hyperparameter, output_folder
 from benchmark.experiments import Sweep, included_sweeps, load_sweep
 from benchmark.exports import ended_runs, export_study
 from benchmark.figures import figures, study_folders
+from benchmark.processes import share_of_cores, start_workers, stop, terminate
 from benchmark.progress import Tally, display
 from benchmark.provenance import conditions
-from benchmark.storages import open_storage
+from benchmark.storages import DEFAULT_STORAGE, open_storage
 from benchmark.studies import Ledger
 from benchmark.sweep_files import SweepError
-from benchmark.worker import BEAT, GRACE, terminate
+from benchmark.worker import BEAT, GRACE
 
-DEFAULT_STORAGE = "sqlite:///logs/sweeps/studies.db"
 # Seconds between two looks at the study
 LOOK = 2.0
 
@@ -61,27 +59,17 @@ def describe(sweep: Sweep, argv: Sequence[str], device: str) -> dict[str, Any]:
     }
 
 
-def start_workers(args: argparse.Namespace, study: str) -> list[subprocess.Popen[bytes]]:
+def worker_command(args: argparse.Namespace, study: str) -> list[str]:
     """
-    Start the processes that train.
+    Say how to start one of the processes that train.
 
     :param args: the command line
     :param study: the study's name
-    :return: the processes
+    :return: its command line
     """
-    threads = args.threads or max((os.cpu_count() or 1) // args.workers, 1)
     command = [sys.executable, "-m", "benchmark.worker", "--study", study, "--storage", args.storage]
-    command += ["--logs", str(args.logs), "--threads", str(threads), "--device", args.device, "--parent", str(os.getpid())]
-    command += ["--beat", str(args.beat), "--grace", str(args.grace)]
-    folder = args.logs / study
-    folder.mkdir(parents=True, exist_ok=True)
-    # A library's threads are counted when it is loaded
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
-    workers = []
-    for number in range(args.workers):
-        with open(folder / f"worker-{number}.log", "ab") as log:
-            workers.append(subprocess.Popen(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, env=environment))
-    return workers
+    command += ["--logs", str(args.logs), "--threads", str(args.threads), "--device", args.device]
+    return [*command, "--parent", str(os.getpid()), "--beat", str(args.beat), "--grace", str(args.grace)]
 
 
 def run(sweep: Sweep, study: str, args: argparse.Namespace, argv: Sequence[str]) -> Path:
@@ -100,7 +88,7 @@ def run(sweep: Sweep, study: str, args: argparse.Namespace, argv: Sequence[str])
     ended, description["earlier"] = ended_runs(args.results / study, description) if args.adopt else ([], [])
     ledger.open(sweep, description, ended)
     tally = Tally(sweep.file.steps)
-    workers = start_workers(args, study)
+    workers = start_workers(worker_command(args, study), args.workers, args.threads, args.logs / study)
     try:
         with display(study) as show:
             while True:
@@ -124,46 +112,6 @@ def run(sweep: Sweep, study: str, args: argparse.Namespace, argv: Sequence[str])
             f"{args.logs / study}/worker-*.log say why. The same command goes on."
         )
     return folder
-
-
-def stop(workers: Sequence[subprocess.Popen[bytes]]) -> None:
-    """
-    Let processes save their runs' states, and end.
-
-    :param workers: the processes
-    """
-    for worker in workers:
-        if worker.poll() is None:
-            worker.send_signal(signal.SIGTERM)
-    try:
-        for worker in workers:
-            worker.wait()
-    except KeyboardInterrupt:
-        # Asked a second time
-        for worker in workers:
-            worker.kill()
-
-
-def hyperparameter(text: str) -> tuple[str, Any]:
-    """
-    Read a hyperparameter, as in ``learning_starts=500``.
-
-    :param text: the argument
-    :return: its name and value
-    :raises argparse.ArgumentTypeError: if it is not of that form
-    """
-    name, separator, value = text.partition("=")
-    if not separator or not name.isidentifier():
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form name=value")
-    try:
-        read = yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} has a value that is no YAML: {error}") from error
-    try:
-        # YAML takes 1e-3 for a string
-        return name, float(read) if isinstance(read, str) else read
-    except ValueError:
-        return name, read
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -204,7 +152,9 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         "--beat", type=float, default=BEAT, help="seconds between a worker's heartbeats (default: %(default)s)"
     )
     parser.add_argument("--grace", type=float, default=GRACE, help="seconds until a silent worker is given up")
-    return parser.parse_args(argv)
+    args = parser.parse_args(argv)
+    args.threads = args.threads or share_of_cores(args.workers)
+    return args
 
 
 def load(name: str, args: argparse.Namespace) -> Sweep:

@@ -51,8 +51,8 @@ class Clock:
 class Heart:
     """A heart that beats with the training, so that a process makes its calls one after another."""
 
-    def __init__(self, ledger, claim, interval, parent):
-        self.ledger, self.claim, self.count = ledger, claim, 0
+    def __init__(self, beat, interval, parent):
+        self.beat, self.count = beat, 0
 
     def __enter__(self):
         self.watch(0)
@@ -62,7 +62,7 @@ class Heart:
         pass
 
     def watch(self, step):
-        self.ledger.beat(self.claim, f"{id(self)}-{self.count}", step, 1.0)
+        self.beat(f"{id(self)}-{self.count}", step, 1.0)
         self.count += 1
 
 

@@ -15,9 +15,9 @@ from optuna.trial import TrialState
 from studies import GRACE, Clock, Crew, assert_each_run_once, make_sweep, mortal, pretend, pretend_to_train, work_through
 
 from benchmark import worker
-from benchmark.silence import PROGRESS
+from benchmark.heartbeats import PROGRESS, TrialLostError
 from benchmark.storages import open_storage, patiently
-from benchmark.studies import ERROR, KEY, OUTCOME, Ledger, TrialLostError
+from benchmark.studies import ERROR, KEY, OUTCOME, Ledger
 from benchmark.sweep_files import SweepError
 from benchmark.worker import work
 
@@ -166,7 +166,7 @@ def test_a_process_that_comes_back_has_lost_its_trial(ledger):
     other.recover()
     clock.sleep(GRACE + 1)
     other.recover()
-    with pytest.raises(TrialLostError, match="seed=0"):
+    with pytest.raises(TrialLostError, match="trial 0"):
         ledger.beat(claim, "1-0", 0, 0.0)
     with pytest.raises(TrialLostError):
         ledger.report(claim, 10, 1.0)

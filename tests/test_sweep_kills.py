@@ -230,7 +230,9 @@ def started(command, home):
     home.mkdir(exist_ok=True)
     environment = {**os.environ, "HOME": str(home), "PYTHONPATH": str(REPOSITORY), "CUDA_VISIBLE_DEVICES": ""}
     with open(home / "output.log", "ab") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=log, cwd=home, env=environment)
+        # A shell that runs the tests in the background lets all of them ignore Ctrl-C
+        heed = dict(preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+        process = subprocess.Popen(command, stdout=log, stderr=log, cwd=home, env=environment, **heed)
     try:
         yield process
     finally:
@@ -260,25 +262,28 @@ def trials_of(url, study):
     return Ledger(storage, study).trials() if study in names else []
 
 
-def is_training(url, n_runs):
-    return sum("progress" in trial.user_attrs for trial in trials_of(url, "tiny")) >= n_runs
+def training(url):
+    """The trials of runs that are being trained."""
+    trials = trials_of(url, "tiny")
+    return [trial for trial in trials if trial.state is TrialState.RUNNING and "progress" in trial.user_attrs]
 
 
 @pytest.mark.slow
 def test_a_sweeps_command_is_killed_interrupted_and_goes_on(tmp_path):
-    sweep = write_sweep(tmp_path, steps=2000, methods=["TD3"], checkpoint_interval=100)
+    sweep = write_sweep(tmp_path, steps=8000, methods=["TD3"], checkpoint_interval=100)
     url = f"sqlite:///{tmp_path}/studies.db"
     command = command_of(sweep, tmp_path, "--workers", "2", "--storage", url)
     with started(command, tmp_path / "home") as process:
-        wait_until(lambda: is_training(url, 2), "no run has begun")
+        wait_until(lambda: len(training(url)) == 2, "no run has begun")
         workers = family(process)
         assert len(workers) >= 2
         process.kill()
         # They see by themselves that their parent is gone
         assert psutil.wait_procs(workers, timeout=60)[1] == []
+        # They have given back what they had
+        assert [trial.state for trial in trials_of(url, "tiny")] == [TrialState.FAIL] * 2 + [TrialState.WAITING] * 2
     with started(command, tmp_path / "home") as process:
-        wait_until(lambda: is_training(url, 4) or len(trials_of(url, "tiny")) > 2, "no run was taken up")
-        wait_until(lambda: TrialState.RUNNING in [trial.state for trial in trials_of(url, "tiny")], "no run goes on")
+        wait_until(lambda: training(url), "no run was taken up")
         workers = family(process)
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=120) == 128 + signal.SIGINT
