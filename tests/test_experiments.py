@@ -98,6 +98,16 @@ def test_later_settings_go_before_earlier_ones(tmp_path, sweep_of):
     assert sweep.runs()[0].key == "TD3,batch_size=8,Pendulum-v1,seed=0"
 
 
+def test_short_runs_learn_too():
+    def starts(name, **overrides):
+        return {run.hyperparams["learning_starts"] for run in load_sweep(name, overrides).runs()}
+
+    assert starts("e3") == {10_000}
+    assert starts("e3", steps=3_000) == {300}
+    assert starts("e3", steps=3_000, hyperparams={"learning_starts": 50}) == {50}
+    assert starts("e7", steps=3_000) == {0, 1_000, 10_000}
+
+
 def test_methods_of_ones_own(sweep_of):
     sweep = sweep_of(methods={"mine": {"algo": "ppo", "hyperparams": {"n_steps": 64}, "tuned": True}})
     assert {(run.method, run.algo, run.tuned) for run in sweep.runs()} == {("mine", "ppo", True)}
