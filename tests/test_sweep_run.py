@@ -11,7 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from benchmark.experiments import load_sweep
 from benchmark.random_actions import RandomActions
 from benchmark.report import read_curve, run_in
-from benchmark.run import run_folder, train
+from benchmark.run import forget_states, run_folder, train
 from sb3_cgp.resumable import ResumableAlgorithm, resumable
 
 TINY = dict(learning_starts=40, batch_size=8, buffer_size=400, policy_kwargs="dict(net_arch=[8, 8])")
@@ -100,7 +100,11 @@ def test_the_other_scripts_of_rl_zoo3_find_what_they_look_for(tmp_path, run_of):
     hyperparams, stats_path = get_saved_hyperparams(str(found.settings_folder), norm_reward=False)
     assert hyperparams["normalize"]
     assert stats_path == str(found.settings_folder)
+    # States are kept until the study knows of the run's end
+    assert (folder / "state").exists()
+    forget_states(folder)
     assert not (folder / "state").exists()
+    assert found.model_path.is_file()
 
 
 def test_what_is_trained_is_what_the_sweep_says(tmp_path, run_of):
