@@ -12,7 +12,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainings import SMALL, Interruption, Stop
+from trainings import SMALL
 
 from sb3_cgp import CGP
 from sb3_cgp.callbacks import TrainingCheckpointCallback
@@ -182,12 +182,20 @@ def parameters_equal(one, other):
 
 def test_processes_forked_during_the_training_end_by_sigterm(tmp_path):
     ended = []
+    context = multiprocessing.get_context("fork")
+    is_running = context.Event()
+
+    def run():
+        is_running.set()
+        time.sleep(60)
 
     def fork():
-        process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(30,))
+        process = context.Process(target=run)
         process.start()
+        # Python forgets a signal that comes while it forks
+        assert is_running.wait(30)
         process.terminate()
-        process.join(10)
+        process.join(30)
         ended.append(process.exitcode)
         process.kill()
 
@@ -220,8 +228,9 @@ def test_tensorboard_goes_on_in_the_trainings_own_folder(tmp_path):
     logs = str(tmp_path / "logs")
     arguments = dict(env="Pendulum-v1", tensorboard_log=logs)
     make_model(**arguments).learn(800, log_interval=1)
-    with pytest.raises(Interruption):
-        make_model(**arguments).learn(800, [TrainingCheckpointCallback(210, tmp_path / "state"), Stop(690)], log_interval=1)
+    stop = Do(690, lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        make_model(**arguments).learn(800, [TrainingCheckpointCallback(210, tmp_path / "state"), stop], log_interval=1)
     # The newest folder is another's
     make_model(**arguments).learn(30)
     # TensorBoard puts a folder's files into the order of the second in their names
