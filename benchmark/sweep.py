@@ -34,16 +34,20 @@ DEFAULT_STORAGE = "sqlite:///logs/sweeps/studies.db"
 LOOK = 2.0
 
 
-def describe(sweep: Sweep, argv: Sequence[str], device: str) -> dict[str, Any]:
+def describe(sweep: Sweep, argv: Sequence[str], device: str, threads: int = 1) -> dict[str, Any]:
     """
     Say what a sweep is, for the study and for the page on it.
 
     :param sweep: the sweep
     :param argv: the command line
     :param device: where the networks compute
+    :param threads: PyTorch's threads in each process
     :return: plain data
     """
     file = sweep.file
+    circumstances = conditions("benchmark.sweep", argv, th.device("cpu") if device == "auto" else th.device(device))
+    # Not this process's, which trains nothing
+    circumstances["machine"]["torch_threads"] = threads
     return {
         "title": file.title,
         "experiment": sweep.name,
@@ -57,8 +61,18 @@ def describe(sweep: Sweep, argv: Sequence[str], device: str) -> dict[str, Any]:
         "settings_in_words": "; ".join(sweep.changes),
         "runs_planned": len(sweep.runs()),
         "configurations": {run.configuration: {"algo": run.algo, **run.hyperparams} for run in sweep.runs()},
-        **conditions("benchmark.sweep", argv, th.device("cpu") if device == "auto" else th.device(device)),
+        **circumstances,
     }
+
+
+def threads_of_each(args: argparse.Namespace) -> int:
+    """
+    Share the processor's cores out.
+
+    :param args: the command line
+    :return: PyTorch's threads in each process
+    """
+    return args.threads or max((os.cpu_count() or 1) // args.workers, 1)
 
 
 def start_workers(args: argparse.Namespace, study: str) -> list[subprocess.Popen[bytes]]:
@@ -69,7 +83,7 @@ def start_workers(args: argparse.Namespace, study: str) -> list[subprocess.Popen
     :param study: the study's name
     :return: the processes
     """
-    threads = args.threads or max((os.cpu_count() or 1) // args.workers, 1)
+    threads = threads_of_each(args)
     command = [sys.executable, "-m", "benchmark.worker", "--study", study, "--storage", args.storage]
     command += ["--logs", str(args.logs), "--threads", str(threads), "--device", args.device, "--parent", str(os.getpid())]
     command += ["--beat", str(args.beat), "--grace", str(args.grace)]
@@ -96,7 +110,7 @@ def run(sweep: Sweep, study: str, args: argparse.Namespace, argv: Sequence[str])
     :raises SystemExit: if runs are left over that no process works on any more
     """
     ledger = Ledger(open_storage(args.storage), study, args.grace)
-    description = describe(sweep, argv, args.device)
+    description = describe(sweep, argv, args.device, threads_of_each(args))
     ended, description["earlier"] = ended_runs(args.results / study, description) if args.adopt else ([], [])
     ledger.open(sweep, description, ended)
     tally = Tally(sweep.file.steps)
