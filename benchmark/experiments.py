@@ -137,7 +137,11 @@ class Sweep:
 
     def _run(self, method: str, task: str, settings: dict[str, Any], seed: int) -> Run:
         file = self.file
-        hyperparams = self.methods[method].hyperparams | file.hyperparams
+        hyperparams = self.methods[method].hyperparams
+        if "learning_starts" in hyperparams:
+            # Shortened runs are to learn, too
+            hyperparams = hyperparams | {"learning_starts": min(hyperparams["learning_starts"], file.steps // 10)}
+        hyperparams = hyperparams | file.hyperparams
         for axis, value in settings.items():
             hyperparams = hyperparams | file.axes[axis].hyperparams(axis, value, method)
         return Run(

@@ -32,16 +32,20 @@ from benchmark.worker import BEAT, GRACE
 LOOK = 2.0
 
 
-def describe(sweep: Sweep, argv: Sequence[str], device: str) -> dict[str, Any]:
+def describe(sweep: Sweep, argv: Sequence[str], device: str, threads: int = 1) -> dict[str, Any]:
     """
     Say what a sweep is, for the study and for the page on it.
 
     :param sweep: the sweep
     :param argv: the command line
     :param device: where the networks compute
+    :param threads: PyTorch's threads in each process
     :return: plain data
     """
     file = sweep.file
+    circumstances = conditions("benchmark.sweep", argv, th.device("cpu") if device == "auto" else th.device(device))
+    # Not this process's, which trains nothing
+    circumstances["machine"]["torch_threads"] = threads
     return {
         "title": file.title,
         "experiment": sweep.name,
@@ -55,7 +59,7 @@ def describe(sweep: Sweep, argv: Sequence[str], device: str) -> dict[str, Any]:
         "settings_in_words": "; ".join(sweep.changes),
         "runs_planned": len(sweep.runs()),
         "configurations": {run.configuration: {"algo": run.algo, **run.hyperparams} for run in sweep.runs()},
-        **conditions("benchmark.sweep", argv, th.device("cpu") if device == "auto" else th.device(device)),
+        **circumstances,
     }
 
 
@@ -84,7 +88,7 @@ def run(sweep: Sweep, study: str, args: argparse.Namespace, argv: Sequence[str])
     :raises SystemExit: if runs are left over that no process works on any more
     """
     ledger = Ledger(open_storage(args.storage), study, args.grace)
-    description = describe(sweep, argv, args.device)
+    description = describe(sweep, argv, args.device, args.threads)
     ended, description["earlier"] = ended_runs(args.results / study, description) if args.adopt else ([], [])
     ledger.open(sweep, description, ended)
     tally = Tally(sweep.file.steps)

@@ -1,10 +1,11 @@
 """A callback that saves the whole training state, so that a training that was stopped goes on as if it had not been."""
 
+import os
 import signal
 import threading
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -24,6 +25,7 @@ class TrainingCheckpointCallback(BaseCallback):
 
     On SIGTERM, as a cluster's scheduler sends it, the state is saved as soon as the step is over, and the process exits with
     status 143 (in offline policy training at once: its start was saved). A second SIGTERM acts as it would without this.
+    Of several such callbacks, the first one does this.
 
     :param save_freq: environment steps between two states, those of all environments together
     :param path: the folder for the states. None saves nothing, unless rl_zoo3 is training: the run's folder, then.
@@ -31,6 +33,7 @@ class TrainingCheckpointCallback(BaseCallback):
     :param verbose: Verbosity level: 0 for no output, 2 for indicating when a state is saved
     :raises ValueError: if an argument is out of its range, or, when the training starts, if the folder holds the states of
         another one, or the replay buffer cannot be saved
+    :raises OSError: when the training starts or a state is due, if the folder cannot be written to
     """
 
     model: "ResumableAlgorithm"
@@ -46,12 +49,13 @@ class TrainingCheckpointCallback(BaseCallback):
         self._rollout_is_over = False
         self._is_in_rollouts = False
         self._previous_handler: Any = None
+        self._watching_process = 0
         self._is_asked_to_stop = False
 
     @property
     def has_state(self) -> bool:
         """Whether there is a state to go on from."""
-        return self.path is not None and len(self._store.steps()) > 0
+        return self.path is not None and len(StateStore(self.path).steps()) > 0
 
     def _on_training_start(self) -> None:
         self._is_in_rollouts = self._rollout_is_over = False
@@ -61,19 +65,17 @@ class TrainingCheckpointCallback(BaseCallback):
         # Offline policy training is a training of its own to callbacks
         if not self.model.is_training_policy:
             check_replay_buffer(self.model._ensure_replay_buffer())
-            is_another = self.has_state and self.model.resumption is None and self.model.saved_to != self._folder
+            is_another = self.has_state and self._folder not in self.model.saved_to
             allowed = "a folder without the states of another training: go on with that by `CGP.resume`, or choose another"
             require(not is_another, "path", str(self.path), allowed)
+            self._store = StateStore(self._folder, self.keep)
+            self._store.prepare()
         self._watch_for_termination()
 
     @property
     def _folder(self) -> Path:
         assert self.path is not None
         return Path(self.path).resolve()
-
-    @property
-    def _store(self) -> StateStore:
-        return StateStore(self._folder, self.keep)
 
     def _on_rollout_start(self) -> None:
         self._is_in_rollouts = True
@@ -83,14 +85,14 @@ class TrainingCheckpointCallback(BaseCallback):
         if self._is_asked_to_stop:
             if self.num_timesteps > self._saved_at or not self.has_state:
                 self._save()
-            raise SystemExit(128 + signal.SIGTERM)
+            self._stop()
         if self.num_timesteps // self.save_freq > self._saved_at // self.save_freq:
             self._save()
 
     def _on_step(self) -> bool:
         self._rollout_is_over = False
         if self._is_asked_to_stop and not self._is_in_rollouts:
-            raise SystemExit(128 + signal.SIGTERM)
+            self._stop()
         return True
 
     def _on_rollout_end(self) -> None:
@@ -103,6 +105,9 @@ class TrainingCheckpointCallback(BaseCallback):
             self._rollout_is_over = False
             self._save()
         self.release()
+        # During the last step or its saving; what follows `learn` could take as long as the training
+        if self._is_asked_to_stop:
+            self._stop()
 
     def get_training_state(self) -> dict[str, int]:
         """
@@ -121,30 +126,40 @@ class TrainingCheckpointCallback(BaseCallback):
         self.n_calls, self.num_timesteps = state["n_calls"], state["num_timesteps"]
 
     def _restore_if_resumed(self) -> None:
-        state, self.model.resumption = self.model.resumption, None
-        if state is not None:
-            restore(self.model, self.model.callback, state)
+        if self.model.resumption is not None:
+            restore(self.model, self.model.callback, self.model.resumption)
+            self.model.resumption = None
             self._saved_at = self.num_timesteps = self.model.num_timesteps
-            self.model.saved_to = None if self.path is None else self._folder
 
     def _save(self) -> None:
         self._saved_at = self.num_timesteps
         settings = {"save_freq": self.save_freq, "keep": self.keep, "verbose": self.verbose}
         state = gather(self.model, self.model.callback)
         self._store.save(self.num_timesteps, state | {"checkpoint": settings})
-        self.model.saved_to = self._folder
+        self.model.saved_to |= {self._folder}
         if self.verbose >= 2:
             print(f"Saving the training state of step {self.num_timesteps} to {self.path}")
 
     def _watch_for_termination(self) -> None:
         self._is_asked_to_stop = False
-        # Python allows it there alone
-        if threading.current_thread() is threading.main_thread() and self._previous_handler is None:
+        handler = signal.getsignal(signal.SIGTERM)
+        is_watched = isinstance(getattr(handler, "__self__", None), TrainingCheckpointCallback)
+        # Python allows it in the main thread alone, and a handler that is not Python's (None) could not be put back
+        if threading.current_thread() is threading.main_thread() and handler is not None and not is_watched:
+            self._watching_process = os.getpid()
             self._previous_handler = signal.signal(signal.SIGTERM, self._note_termination)
 
     def _note_termination(self, number: int, frame: FrameType | None) -> None:
-        self._is_asked_to_stop = True
         self.release()
+        if os.getpid() == self._watching_process:
+            self._is_asked_to_stop = True
+        else:
+            # Forked off during the training, as by a simulator: such a process ends as it would without this
+            os.kill(os.getpid(), number)
+
+    def _stop(self) -> NoReturn:
+        self._is_asked_to_stop = False
+        raise SystemExit(128 + signal.SIGTERM)
 
     def release(self) -> None:
         """Let SIGTERM act as it did before the training."""

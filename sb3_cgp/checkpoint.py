@@ -11,10 +11,13 @@ import random
 import warnings
 from collections import Counter
 from collections.abc import Iterator
+from enum import Enum
+from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -31,6 +34,8 @@ if TYPE_CHECKING:
 State = dict[str, Any]
 # VecNormalize's statistics, which outlive an episode
 STATISTICS = ("obs_rms", "ret_rms")
+# Of a replay buffer's attributes; its environment is saved as the model's
+STATELESS_TYPES = (Enum, FunctionType, np.dtype, spaces.Space, th.device, type, VecEnv)
 
 
 def gather(model: "ResumableAlgorithm", callback: BaseCallback) -> State:
@@ -73,6 +78,7 @@ def restore(model: "ResumableAlgorithm", callback: BaseCallback, state: State) -
     assert model.env is not None
     if state["environment"] is not None:
         restore_environment(model.env, state["environment"])
+        vars(model).update(state["last"])
     _restore_callbacks(callback, state["callbacks"])
     for name, values in state["logger"].items():
         pending = getattr(model.logger, name)
@@ -125,10 +131,15 @@ def check_replay_buffer(buffer: ReplayBuffer) -> None:
     See that a replay buffer can be saved.
 
     :param buffer: the buffer
-    :raises ValueError: if it keeps the environment's information, which may be anything
+    :raises ValueError: if it keeps the environment's information, which may be anything, or has a state of another kind
     """
     copies = isinstance(buffer, HerReplayBuffer) and buffer.copy_info_dict
     require(not copies, "copy_info_dict", copies, "False where the training is saved")
+    state = _replay_state(buffer)
+    saved = {path.partition(".")[0] for path in state["rows"]} | set(state["attributes"]) | {"infos"}
+    for name, value in vars(buffer).items():
+        is_saved = name in saved or isinstance(value, STATELESS_TYPES)
+        require(is_saved, f"replay_buffer.{name}", value, "plain data or an array where the training is saved")
 
 
 def walk(callback: BaseCallback) -> list[BaseCallback]:

@@ -248,8 +248,8 @@ def _watching_workers(env: VecEnv | None) -> Iterator[_WorkerWatch | None]:
     try:
         yield watch
     except KeyboardInterrupt:
-        # A terminal sends it to the workers too, which end by it
-        watch.wait(timeout=0.5)
+        # A terminal sends it to the workers too, which end by it, on a busy machine not at once
+        watch.wait(timeout=2.0)
         raise
     finally:
         watch.stop()

@@ -3,7 +3,7 @@
 import errno
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -20,9 +20,9 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     :return: where to write, which takes its place at the end unless there was an error
     :raises OSError: if it cannot be written, as on a full disk; it names the file, and the old one is still there
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     beside = _beside(path)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with open(beside, "wb") as file:
             yield file
             file.flush()
@@ -31,7 +31,7 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     except OSError as error:
         raise _not_written(error, path) from error
     finally:
-        beside.unlink(missing_ok=True)
+        _remove(beside)
     sync_folder(path.parent)
 
 
@@ -73,12 +73,18 @@ def replace_all(folder: Path, contents: Mapping[str, bytes | memoryview]) -> Non
         raise _not_written(error, folder / name) from error
     finally:
         for path in beside.values():
-            path.unlink(missing_ok=True)
+            _remove(path)
     sync_folder(folder)
 
 
 def _beside(path: Path) -> Path:
     return path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
+
+
+def _remove(path: Path) -> None:
+    # What is left over may not be there, and cannot hide why
+    with suppress(OSError):
+        path.unlink()
 
 
 def _not_written(error: OSError, path: Path) -> OSError:

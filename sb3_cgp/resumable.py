@@ -2,12 +2,14 @@
 
 import copy
 import io
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch as th
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -16,6 +18,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from sb3_cgp.callbacks import TrainingCheckpointCallback
 from sb3_cgp.checkpoint import State, begin_new_episode, fill_replay_buffer, walk
 from sb3_cgp.files import whole_file
+from sb3_cgp.logs import continued_logger
 from sb3_cgp.store import StateStore
 from sb3_cgp.validation import require
 
@@ -44,8 +47,8 @@ class ResumableAlgorithm(OffPolicyAlgorithm):
     callback: BaseCallback
     # What is to be restored when the training goes on
     resumption: State | None = None
-    # The folder that this training's states are in
-    saved_to: Path | None = None
+    # The folders that this training's states are in
+    saved_to: frozenset[Path] = frozenset()
     # Environment steps when the training started that is going on, or was interrupted
     _training_started_at: int = 0
     # Whether the critics have learnt since the policy was last trained offline
@@ -57,7 +60,7 @@ class ResumableAlgorithm(OffPolicyAlgorithm):
     def resume(
         cls: type[SelfResumableAlgorithm],
         path: str | Path,
-        env: GymEnv,
+        env: GymEnv | str,
         device: th.device | str = "auto",
         **kwargs: Any,
     ) -> SelfResumableAlgorithm:
@@ -71,7 +74,8 @@ class ResumableAlgorithm(OffPolicyAlgorithm):
         The state holds SB3's zip, which is unpickled and can run code, as with :meth:`load`: resume your own trainings only.
 
         :param path: the folder of the states
-        :param env: the environment, made as at first; its state is restored when ``learn`` starts
+        :param env: the environment, made as at first (if registered in Gym, can be str); its state is restored when
+            ``learn`` starts
         :param device: Device on which the code should run.
         :param kwargs: arguments to change in the model, see :meth:`load`
         :return: the model
@@ -80,10 +84,18 @@ class ResumableAlgorithm(OffPolicyAlgorithm):
         """
         _, state = StateStore(path).load()
         require(state["algorithm"] == cls.__name__, "path", str(path), f"of {cls.__name__}, not {state['algorithm']}")
-        model = cls.load(io.BytesIO(state.pop("model")), env, device, force_reset=False, **kwargs)
+        model = cls.load(io.BytesIO(state.pop("model")), maybe_make_env(env, 0), device, force_reset=False, **kwargs)
+        assert model.env is not None
         require(model.n_envs == state["n_envs"], "env.num_envs", model.n_envs, f"{state['n_envs']}, as was saved")
+        # The same object, as at first: environments may draw from it, too
+        model.action_space = model.env.action_space
         fill_replay_buffer(model._ensure_replay_buffer(), state.pop("replay_buffer"))
-        model.resumption = state | {"checkpoint": state["checkpoint"] | {"path": path}}
+        model.resumption = state | {
+            "checkpoint": state["checkpoint"] | {"path": path},
+            # `set_env` would forget them
+            "last": {name: getattr(model, name) for name in ("_last_obs", "_last_episode_starts", "_last_original_obs")},
+        }
+        model.saved_to = frozenset({Path(path).resolve()})
         return model
 
     def save(
@@ -130,14 +142,22 @@ class ResumableAlgorithm(OffPolicyAlgorithm):
             begin_new_episode(self, self.resumption)
         # SB3 resets it
         action_noise = copy.deepcopy(self.action_noise)
+        has_logger, folder = self._custom_logger, self.resumption["log_folder"]
+        if not has_logger and self.tensorboard_log is not None and folder is not None and os.path.isdir(folder):
+            # SB3's would be the newest run's
+            self.set_logger(continued_logger(folder, self.num_timesteps + 1, self.verbose))
         steps_left = self._training_started_at + total_timesteps - self.num_timesteps
         result = super()._setup_learn(steps_left, callback, False, *args, **kwargs)
-        self.action_noise = action_noise
+        self.action_noise, self._custom_logger = action_noise, has_logger
         return result
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         callback = super()._init_callback(callback, progress_bar)
-        if self.resumption is not None and not any(isinstance(each, TrainingCheckpointCallback) for each in walk(callback)):
+        checkpoints = [each for each in walk(callback) if isinstance(each, TrainingCheckpointCallback)]
+        for each in checkpoints:
+            allowed = "None: give a TrainingCheckpointCallback to `learn` itself, as others do not tell it when a step is over"
+            require(each.parent is None, "parent", each.parent, allowed)
+        if self.resumption is not None and not checkpoints:
             callback = CallbackList([callback, TrainingCheckpointCallback(**self.resumption["checkpoint"])])
             callback.init_callback(self)
         self.callback = callback

@@ -18,14 +18,15 @@ import yaml
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import ALGOS, exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
-from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat, make_output_format
+from rl_zoo3.utils import get_callback_list
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
-from torch.utils.tensorboard import SummaryWriter
 
+from sb3_cgp.callbacks import TrainingCheckpointCallback
 from sb3_cgp.environments import restore_environment
-from sb3_cgp.monitors import cut_monitors, read_start
+from sb3_cgp.logs import cut_monitors, read_start
 from sb3_cgp.resumable import ResumableAlgorithm, resumable
 from sb3_cgp.store import StateStore
 from sb3_cgp.zoo import ALGO, register, state_folder
@@ -104,11 +105,11 @@ class ResumedExperiment(ExperimentManager):
             exp_manager.make_vec_env = make_vec_env
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> ResumableAlgorithm:
-        model = resumable(ALGOS[self.algo]).resume(state_folder(self.save_path), env, device=self.device)  # type: ignore[arg-type]
+        algorithm = resumable(ALGOS[self.algo])  # type: ignore[arg-type]
+        model = algorithm.resume(states_of(Path(self.save_path), self.saved_hyperparams), env, device=self.device)
         assert model.resumption is not None
         print(f"Resuming {self.save_path} at step {model.num_timesteps}")
         self._continue_monitors(env, model.num_timesteps, model.resumption["environment"])
-        self._continue_tensorboard(model, model.resumption["log_folder"])
         return model
 
     def _continue_monitors(self, env: VecEnv, timestep: int, state: Any) -> None:
@@ -124,25 +125,9 @@ class ResumedExperiment(ExperimentManager):
             # Times in the file count from its header
             env.env_method("set_wrapper_attr", "t_start", read_start(path), indices=index)
 
-    def _continue_tensorboard(self, model: ResumableAlgorithm, folder: str | None) -> None:
-        """Write to the run's own events, of which TensorBoard hides those that came after the state was saved."""
-        if self.tensorboard_log is None or folder is None:
-            return
-        outputs: list[KVWriter] = [make_output_format("stdout", folder)] if self.verbose >= 1 else []
-        model.set_logger(Logger(folder, [*outputs, _ContinuedTensorBoard(folder, model.num_timesteps + 1)]))
-
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         # What the run was started with stays as it is
         print(f"Log path: {self.save_path}")
-
-
-class _ContinuedTensorBoard(TensorBoardOutputFormat):
-    """SB3's writer for TensorBoard, in a folder that has events."""
-
-    def __init__(self, folder: str, first_step: int):
-        # SB3's constructor makes a writer that purges nothing
-        self.writer = SummaryWriter(log_dir=folder, purge_step=first_step)
-        self._is_closed = False
 
 
 def read_run(folder: Path) -> tuple[argparse.Namespace, dict[str, Any]]:
@@ -168,6 +153,19 @@ def read_run(folder: Path) -> tuple[argparse.Namespace, dict[str, Any]]:
     return argparse.Namespace(**args), hyperparams
 
 
+def states_of(folder: Path, hyperparams: dict[str, Any]) -> str:
+    """
+    Tell where a run's training states are.
+
+    :param folder: the run's folder
+    :param hyperparams: the run's hyperparameters
+    :return: the folder that its first checkpoint callback was given, or the one that it takes by itself
+    """
+    callbacks = get_callback_list(hyperparams)
+    given = [each.path for each in callbacks if isinstance(each, TrainingCheckpointCallback) and each.path is not None]
+    return str(given[0]) if given else state_folder(str(folder))
+
+
 def is_finished(folder: Path, args: argparse.Namespace, hyperparams: dict[str, Any]) -> bool:
     """
     Tell whether there is anything left to train.
@@ -175,20 +173,25 @@ def is_finished(folder: Path, args: argparse.Namespace, hyperparams: dict[str, A
     :param folder: the run's folder
     :param args: the run's command line
     :param hyperparams: the run's hyperparameters
-    :return: whether the final model is there, of a training that was not interrupted from the keyboard
+    :return: whether the final model is there, of a training that was not interrupted from the keyboard, be it within the
+        offline training of its policy
     :raises FileNotFoundError: if there is something left, and no state to go on from
     """
-    states = state_folder(str(folder))
+    states = states_of(folder, hyperparams)
     steps = StateStore(states).steps()
     env_name = EnvironmentName(args.env)
-    has_model = (folder / f"{env_name}.zip").is_file()
+    model = folder / f"{env_name}.zip"
     n_timesteps = args.n_timesteps if args.n_timesteps > 0 else int(hyperparams["n_timesteps"])
-    if not steps and not has_model:
+    if not steps and not model.is_file():
         raise FileNotFoundError(
             f"There is no state in {states}: the run ended before it saved one, or has no TrainingCheckpointCallback. "
             f"Start it anew, by the command in {folder / env_name / 'command.txt'}"
         )
-    return has_model and (not steps or max(steps) >= n_timesteps)
+    if not model.is_file() or not steps:
+        return model.is_file()
+    data, _, _ = load_from_zip_file(model, device="cpu")
+    assert data is not None
+    return max(steps) >= n_timesteps and not data["_policy_is_due"]
 
 
 def resume(folder: Path, args: argparse.Namespace, hyperparams: dict[str, Any]) -> None:

@@ -1,8 +1,9 @@
 """
 A folder of training states: each as a whole or not at all, verified when read, and nothing written twice.
 
-``state-<step>.json`` holds a state's plain data. Arrays lie in ``blocks``, in files called by the SHA-256 of what they hold,
-so that states share what they have in common: a replay buffer is in every state, and what has changed of it is written.
+``state-<step>.json`` holds a state's plain data. Arrays lie in a folder of blocks, files called by the SHA-256 of what they
+hold, so that states share what they have in common: a replay buffer is in every state, and what has changed of it is written.
+There are two such folders, and states take them in turn: no damage to one file can take two states that follow each other.
 Nothing is pickled.
 """
 
@@ -20,7 +21,8 @@ import torch as th
 from sb3_cgp.files import PARTIAL, write_atomically
 
 FORMAT = "sb3_cgp training state"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+BLOCK_FOLDERS = ("blocks-0", "blocks-1")
 # Of an array
 BLOCK_BYTES = 2**22
 # Arrays below it share blocks
@@ -49,14 +51,24 @@ class StateStore:
     arrays and scalars, and PyTorch tensors, which come back on the CPU.
 
     :param folder: the folder; it is made when the first state is saved
-    :param keep: how many states to keep, at least 1
+    :param keep: how many states to keep, at least 1. If it is 1, only one of the folders of blocks is used.
     """
 
     def __init__(self, folder: str | Path, keep: int = 2):
         self.folder = Path(folder)
         self.keep = keep
         # Written or read and verified by this process
-        self._good_blocks: set[str] = set()
+        self._good_blocks: set[Path] = set()
+
+    def prepare(self) -> None:
+        """
+        Make the folder, and see that states can be written to it.
+
+        :raises OSError: if they cannot, naming the file
+        """
+        attempt = self.folder / f"{PARTIAL}attempt"
+        write_atomically(attempt, b"")
+        attempt.unlink()
 
     def steps(self) -> list[int]:
         """
@@ -78,9 +90,11 @@ class StateStore:
         :raises TypeError: if something in it is not plain data, naming where it is
         :raises OSError: if it cannot be written, naming the file; older states are still there
         """
-        writer = _Writer(self)
-        body = {"format": FORMAT, "version": FORMAT_VERSION, "step": step, "state": writer.encode(dict(state), "state")}
+        blocks = self._next_block_folder(step)
+        writer = _Writer(self, blocks)
+        tree = writer.encode(dict(state), "state")
         writer.flush()
+        body = {"format": FORMAT, "version": FORMAT_VERSION, "step": step, "blocks": blocks, "state": tree}
         content = json.dumps(body)
         digest = hashlib.sha256(content.encode()).hexdigest()
         write_atomically(self._manifest(step), f'{{"sha256": "{digest}", "body": {content}}}\n'.encode())
@@ -98,7 +112,7 @@ class StateStore:
         for step in reversed(self.steps()):
             try:
                 body = self._read_manifest(step)
-                state = _Reader(self).decode(body["state"])
+                state = _Reader(self, body["blocks"]).decode(body["state"])
             except DamagedStateError as error:
                 damaged.append(str(error))
                 continue
@@ -112,8 +126,15 @@ class StateStore:
     def _manifest(self, step: int) -> Path:
         return self.folder / f"state-{step:012d}.json"
 
-    def _block(self, digest: str) -> Path:
-        return self.folder / "blocks" / digest
+    def _next_block_folder(self, step: int) -> str:
+        """Choose where a state's blocks go: not where those of the one before it are, so that one of them survives damage."""
+        for each in reversed([each for each in self.steps() if each < step]):
+            try:
+                last = BLOCK_FOLDERS.index(self._read_manifest(each)["blocks"])
+            except DamagedStateError:
+                continue
+            return BLOCK_FOLDERS[last if self.keep == 1 else 1 - last]
+        return BLOCK_FOLDERS[0]
 
     def _read_manifest(self, step: int) -> dict[str, Any]:
         path = self._manifest(step)
@@ -127,19 +148,27 @@ class StateStore:
         body = json.loads(match[2])
         if (body.get("format"), body.get("version"), body.get("step")) != (FORMAT, FORMAT_VERSION, step):
             raise DamagedStateError(path, f"it is not version {FORMAT_VERSION} of a {FORMAT} of step {step}")
+        if body["blocks"] not in BLOCK_FOLDERS:
+            raise DamagedStateError(path, f"its blocks are not in one of {', '.join(BLOCK_FOLDERS)}")
         return body
 
-    def _has_good_block(self, digest: str) -> bool:
+    def _block(self, blocks: str, digest: str) -> Path:
+        return self.folder / blocks / digest
+
+    def _has_good_block(self, blocks: str, digest: str, size: int) -> bool:
         """Whether a block is there, and what it ought to be."""
-        if digest not in self._good_blocks:
-            try:
-                self._read_block(digest)
-            except DamagedStateError:
-                return False
+        path = self._block(blocks, digest)
+        try:
+            if path in self._good_blocks:
+                # A look suffices, as its content was verified: there may be gigabytes of them
+                return path.stat().st_size == size
+            self._read_block(blocks, digest)
+        except (DamagedStateError, FileNotFoundError):
+            return False
         return True
 
-    def _read_block(self, digest: str) -> bytes:
-        path = self._block(digest)
+    def _read_block(self, blocks: str, digest: str) -> bytes:
+        path = self._block(blocks, digest)
         if not DIGEST.fullmatch(digest):
             raise DamagedStateError(path, "it is not called by a checksum")
         try:
@@ -148,14 +177,14 @@ class StateStore:
             raise DamagedStateError(path, f"it cannot be read ({error.strerror})") from error
         if hashlib.sha256(content).hexdigest() != digest:
             raise DamagedStateError(path, "its checksum is wrong: it was altered or cut short")
-        self._good_blocks.add(digest)
+        self._good_blocks.add(path)
         return content
 
-    def _write_block(self, content: bytes | memoryview) -> str:
+    def _write_block(self, blocks: str, content: memoryview) -> str:
         digest = hashlib.sha256(content).hexdigest()
-        if not self._has_good_block(digest):
-            write_atomically(self._block(digest), content)
-            self._good_blocks.add(digest)
+        if not self._has_good_block(blocks, digest, content.nbytes):
+            write_atomically(self._block(blocks, digest), content)
+            self._good_blocks.add(self._block(blocks, digest))
         return digest
 
     def _prune(self, step: int) -> None:
@@ -164,15 +193,18 @@ class StateStore:
         kept = [each for each in steps if each <= step][-self.keep :]
         for each in set(steps) - set(kept):
             self._manifest(each).unlink(missing_ok=True)
-        needed: set[str] = set()
+        needed: set[Path] = set()
         for each in kept:
             try:
-                needed.update(_digests(self._read_manifest(each)["state"]))
+                body = self._read_manifest(each)
             except DamagedStateError:
                 # Which blocks it needs is not known
                 return
-        for path in (*self.folder.glob(f"{PARTIAL}*"), *(self.folder / "blocks").iterdir()):
-            if path.name not in needed:
+            needed.update(self._block(body["blocks"], digest) for digest in _digests(body["state"]))
+        folders = [self.folder / name for name in BLOCK_FOLDERS]
+        blocks = [path for folder in folders if folder.is_dir() for path in folder.iterdir()]
+        for path in (*self.folder.glob(f"{PARTIAL}*"), *blocks):
+            if path not in needed:
                 path.unlink(missing_ok=True)
         self._good_blocks &= needed
 
@@ -182,10 +214,11 @@ class _Writer:
     Makes JSON of a state, and writes its arrays.
 
     :param store: where to
+    :param blocks: the folder of its blocks
     """
 
-    def __init__(self, store: StateStore):
-        self._store = store
+    def __init__(self, store: StateStore, blocks: str):
+        self._store, self._blocks = store, blocks
         self._small = bytearray()
         # Their references, which learn of their block when it is written
         self._waiting: list[dict[str, Any]] = []
@@ -222,7 +255,7 @@ class _Writer:
         """Write bytes, and say where they are."""
         if content.nbytes >= SMALL_BYTES:
             blocks = [content[start : start + BLOCK_BYTES] for start in range(0, content.nbytes, BLOCK_BYTES)]
-            return {"size": content.nbytes, "blocks": [self._store._write_block(block) for block in blocks]}
+            return {"size": content.nbytes, "blocks": [self._store._write_block(self._blocks, block) for block in blocks]}
         reference: dict[str, Any] = {"size": content.nbytes, "start": len(self._small), "blocks": []}
         self._small += content
         self._waiting.append(reference)
@@ -230,7 +263,7 @@ class _Writer:
 
     def flush(self) -> None:
         """Write what small arrays share."""
-        digest = self._store._write_block(bytes(self._small))
+        digest = self._store._write_block(self._blocks, memoryview(self._small))
         for reference in self._waiting:
             reference["blocks"].append(digest)
 
@@ -240,10 +273,11 @@ class _Reader:
     Makes a state of JSON, and reads its arrays.
 
     :param store: where from
+    :param blocks: the folder of its blocks
     """
 
-    def __init__(self, store: StateStore):
-        self._store = store
+    def __init__(self, store: StateStore, blocks: str):
+        self._store, self._blocks = store, blocks
         self._shared: dict[str, bytes] = {}
 
     def decode(self, value: Any) -> Any:
@@ -274,11 +308,11 @@ class _Reader:
         if "start" in reference:
             (digest,) = digests
             if digest not in self._shared:
-                self._shared[digest] = self._store._read_block(digest)
+                self._shared[digest] = self._store._read_block(self._blocks, digest)
             return bytearray(self._shared[digest][reference["start"] : reference["start"] + size])
         content = bytearray()
         for digest in digests:
-            content += self._store._read_block(digest)
+            content += self._store._read_block(self._blocks, digest)
         return content
 
 

@@ -1,7 +1,9 @@
 """The files of sweeps: what they say, what follows from them, and what is refused."""
 
 import itertools
+import re
 from collections import Counter
+from pathlib import Path
 
 import pytest
 import yaml
@@ -96,6 +98,29 @@ def test_later_settings_go_before_earlier_ones(tmp_path, sweep_of):
         (0.5, 0.1, 16),
     ]
     assert sweep.runs()[0].key == "TD3,batch_size=8,Pendulum-v1,seed=0"
+
+
+def test_the_documented_sweep_is_one(tmp_path):
+    documentation = (Path(__file__).parent.parent / "docs" / "experiments.md").read_text()
+    (example,) = re.findall(r"```yaml\n(.*?)```", documentation, flags=re.DOTALL)
+    (tmp_path / "mine.yml").write_text(example)
+    runs = load_sweep(str(tmp_path / "mine.yml")).runs()
+    assert len(runs) == 2 * 2 * (3 * 2 - 1) * 3
+    samples = {run.hyperparams.get("cem_samples") for run in runs if run.method == "CGP"}
+    assert samples == {16, 64, 256}
+    assert not any("cem_samples" in run.hyperparams for run in runs if run.method == "TQC")
+    rows = dict(re.findall(r"\| `(e\d)` .*\| (\d+) \|", documentation))
+    assert {name: str(sum(len(load_sweep(each).runs()) for each in included_sweeps(name))) for name in rows} == rows
+
+
+def test_short_runs_learn_too():
+    def starts(name, **overrides):
+        return {run.hyperparams["learning_starts"] for run in load_sweep(name, overrides).runs()}
+
+    assert starts("e3") == {10_000}
+    assert starts("e3", steps=3_000) == {300}
+    assert starts("e3", steps=3_000, hyperparams={"learning_starts": 50}) == {50}
+    assert starts("e7", steps=3_000) == {0, 1_000, 10_000}
 
 
 def test_methods_of_ones_own(sweep_of):

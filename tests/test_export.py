@@ -1,5 +1,6 @@
 """Exported policies: they act as ``predict`` does, are written whole, and are loaded from data that runs nothing."""
 
+import base64
 import builtins
 import hashlib
 import json
@@ -7,6 +8,7 @@ import os
 import pickle
 import shutil
 import struct
+import zipfile
 from pathlib import Path
 
 import gymnasium as gym
@@ -402,6 +404,18 @@ def test_pickles_are_refused_and_not_run(folder, tmp_path, name, form, sealed):
     if form == "pickle":
         pickle.loads(pickle.dumps(Payload(marker))).close()
         assert marker.exists(), "the payload is harmless, and the test shows nothing"
+
+
+def test_a_saved_model_holds_no_code(tmp_path):
+    model = CGP("MlpPolicy", "Pendulum-v1", learning_rate="lin_1e-3", learning_starts=5, batch_size=2, buffer_size=10, seed=0)
+    model.learn(10, callback=lambda *_: True).save(tmp_path / "model")
+    with zipfile.ZipFile(tmp_path / "model.zip") as archive:
+        data = json.loads(archive.read("data"))
+    pickles = {name: value[":serialized:"] for name, value in data.items() if type(value) is dict and ":serialized:" in value}
+    assert "lr_schedule" in pickles
+    for name, value in pickles.items():
+        # It is needed to load functions and classes that are pickled by their code, not by their name
+        assert b"cloudpickle" not in base64.b64decode(value), name
 
 
 def test_loading_calls_nothing_that_runs_code(exports, monkeypatch):

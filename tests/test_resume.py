@@ -1,6 +1,7 @@
 """Resumed trainings against straight ones: the same to the bit, wherever they were stopped."""
 
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from environments import Doubles
 from gymnasium import spaces
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
@@ -17,6 +19,7 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv
 from trainings import SMALL, Interruption, Stop, Training, assert_same, fingerprint
 
 from sb3_cgp import CGP
@@ -58,6 +61,34 @@ class Reach(gym.Env):
         self.np_random.bit_generator.state = state["random"]
 
 
+class Images(Doubles):
+    """Images, and a state of which Gymnasium's generator is saved anyway."""
+
+    observation_space = spaces.Box(0, 255, (1, 36, 36), np.uint8)
+
+    def observe(self):
+        return self.np_random.integers(0, 256, (1, 36, 36), np.uint8)
+
+    def get_training_state(self):
+        return {"steps": getattr(self, "steps", None)}
+
+    def set_training_state(self, state):
+        self.steps = state["steps"]
+
+
+class Disturbed(gym.Wrapper):
+    """Draws from its action space, which random actions are drawn from, too."""
+
+    def step(self, action):
+        return self.env.step(np.clip(action + 0.1 * self.action_space.sample(), -2, 2))
+
+    def get_training_state(self):
+        return ()
+
+    def set_training_state(self, state):
+        assert state == ()
+
+
 class Opaque(gym.Wrapper):
     """A wrapper of somebody's own, which may do anything."""
 
@@ -88,6 +119,15 @@ CASES = {
     "lean": dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)),
     "dictionaries": dict(env=Reach, policy="MultiInputPolicy"),
     "hindsight": dict(env=Reach, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer, n_envs=2, save_freq=14),
+    "hindsight, normalised": dict(
+        env=Reach, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer, normalises=True, save_freq=14
+    ),
+    "random steps": dict(learning_starts=90, n_envs=2),
+    "disturbed random steps": dict(env=lambda: Disturbed(gym.make("Pendulum-v1")), learning_starts=90),
+    "images": dict(
+        env=Images, policy="CnnPolicy", policy_kwargs=dict(features_extractor_kwargs=dict(features_dim=4)), steps=60
+    ),
+    "optimizer": dict(policy_kwargs=dict(net_arch=[8], optimizer_class=th.optim.RMSprop, optimizer_kwargs=dict(momentum=0.9))),
 }
 
 
@@ -137,6 +177,15 @@ def test_wherever_it_was_stopped(tmp_path_factory, case, stops, save_freq):
 @any_stops
 def test_wherever_it_was_stopped_more_often(tmp_path_factory, case, stops, save_freq):
     stopped_anywhere(tmp_path_factory.mktemp("training"), case, stops, save_freq)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [dict(), dict(env="Hopper-v5", n_steps=3, normalises=True)], ids=["Pendulum", "Hopper"])
+def test_20_000_steps_straight_and_stopped(tmp_path, case):
+    arguments = case | dict(steps=20_000, save_freq=500, eval_freq=2_000, buffer_size=15_000, learning_starts=1_000)
+    straight, stopped = (Training(tmp_path / name, **arguments) for name in ("straight", "stopped"))
+    stops = sorted(random.Random(0).sample(range(600, 20_000), 4))
+    assert_same(fingerprint(stopped, stopped.run(*stops)), fingerprint(straight, straight.run()))
 
 
 def interrupted(folder, stop=47, **case):
@@ -244,6 +293,25 @@ def test_without_a_path_nothing_happens(tmp_path, monkeypatch):
     )
     assert list(tmp_path.iterdir()) == []
     assert signal.getsignal(signal.SIGTERM) is handler
+
+
+def test_an_environment_that_did_not_fit_can_be_replaced(tmp_path):
+    training = interrupted(tmp_path)
+    expected = training.learn(CGP.resume(tmp_path / "state", training.make_env(7)), None)
+    interrupted(tmp_path / "again")
+    model = CGP.resume(tmp_path / "again" / "state", DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
+    with pytest.raises(ValueError, match=r"`env` is .*, but must be what the state was saved from"):
+        model.learn(120)
+    model.set_env(training.make_env(8))
+    model.learn(120)
+    assert (model.num_timesteps, model._n_updates) == (120, 100)
+    assert th.equal(parameters(model), parameters(expected))
+
+
+def test_the_environment_may_be_given_by_its_name(tmp_path):
+    model = CGP("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[8]), **SMALL)
+    model.learn(30, callback=TrainingCheckpointCallback(10, tmp_path / "state"))
+    assert CGP.resume(tmp_path / "state", "Pendulum-v1").learn(40).num_timesteps == 40
 
 
 def test_what_does_not_fit_is_refused(tmp_path):

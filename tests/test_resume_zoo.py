@@ -15,7 +15,7 @@ from stable_baselines3.common.monitor import load_results
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_cgp import CGP, zoo
-from sb3_cgp.monitors import cut_monitors
+from sb3_cgp.logs import cut_monitors
 from sb3_cgp.resume import main
 from sb3_cgp.store import StateStore
 
@@ -153,6 +153,35 @@ def test_a_run_that_the_keyboard_interrupted_goes_on_although_it_has_a_model(mon
     assert (run_of(tmp_path / "stopped") / "Pendulum-v1.zip").exists()
     monkeypatch.setattr(Stop, "at", None)
     resume(run_of(tmp_path / "stopped"))
+    assert_same(outcome(tmp_path / "stopped"), outcome(tmp_path / "straight"))
+
+
+def test_a_policys_training_that_the_keyboard_interrupted_goes_on(monkeypatch, tmp_path):
+    monkeypatch.setattr("sb3_cgp.offline.ROUND", 10)
+    options = dict(policy_training="'offline'", n_timesteps=400)
+    start(monkeypatch, command(tmp_path / "straight", **options))
+    # Behind the environment's 400 steps, within the policy's training
+    monkeypatch.setattr(Stop, "at", 430)
+    monkeypatch.setitem(globals(), "Interruption", KeyboardInterrupt)
+    callbacks = f"{CHECKPOINT}, 'test_resume_zoo.Stop'"
+    start(monkeypatch, command(tmp_path / "stopped", callbacks=callbacks, **options))
+    assert CGP.load(run_of(tmp_path / "stopped") / "Pendulum-v1.zip").policy.inference == "cem"
+    monkeypatch.setattr(Stop, "at", None)
+    resume(run_of(tmp_path / "stopped"))
+    assert_same(outcome(tmp_path / "stopped"), outcome(tmp_path / "straight"))
+
+
+def test_states_in_a_folder_of_the_users_choice_are_found(monkeypatch, tmp_path, capsys):
+    states = tmp_path / "states"
+    chosen = CHECKPOINT.replace("250", f"250, path='{states}'")
+    start(monkeypatch, command(tmp_path / "straight", n_timesteps=400))
+    monkeypatch.setattr(Stop, "at", 330)
+    with pytest.raises(Interruption):
+        start(monkeypatch, command(tmp_path / "stopped", callbacks=f"{chosen}, 'test_resume_zoo.Stop'", n_timesteps=400))
+    monkeypatch.setattr(Stop, "at", None)
+    resume(run_of(tmp_path / "stopped"))
+    assert not (run_of(tmp_path / "stopped") / "state").exists()
+    assert max(StateStore(states).steps()) == 400
     assert_same(outcome(tmp_path / "stopped"), outcome(tmp_path / "straight"))
 
 

@@ -1,5 +1,6 @@
 """Training states on the disk: what was saved comes back, or is refused by name, whatever happens in between."""
 
+import contextlib
 import errno
 import hashlib
 import json
@@ -23,7 +24,7 @@ from hypothesis.extra import numpy as st_numpy
 
 from sb3_cgp import store as store_module
 from sb3_cgp.files import write_atomically
-from sb3_cgp.store import StateStore
+from sb3_cgp.store import BLOCK_FOLDERS, StateStore
 
 ARRAYS = st_numpy.arrays(
     st.sampled_from([np.dtype(each) for each in ("f4", "f8", "i8", "u1", "?", "c16", ">f4", "f2")]),
@@ -108,15 +109,44 @@ def test_only_what_has_changed_of_a_large_array_is_written(tmp_path, monkeypatch
     monkeypatch.setattr(store_module, "write_atomically", write)
     rows = np.random.default_rng(0).standard_normal((40_000, 4), dtype=np.float32)  # ten blocks
     store = StateStore(tmp_path)
-    store.save(1, {"rows": rows})
-    assert sum(size == 2**16 for _, size in written) == 9
-    written.clear()
-    rows[:400] += 1
-    store.save(2, {"rows": rows})
-    # A block, what small arrays share, and the manifest
-    assert [size for _, size in written if size == 2**16] == [2**16]
-    assert len(written) <= 3
-    assert_same(StateStore(tmp_path).load()[1], {"rows": rows})
+    # To one folder, and to the other
+    for step in (1, 2):
+        store.save(step, {"rows": rows})
+        assert sum(size == 2**16 for _, size in written) == 9
+        written.clear()
+    for step in (3, 4):
+        rows[:400] += 1
+        store.save(step, {"rows": rows})
+        # A block, what small arrays share, and the manifest
+        assert [size for _, size in written if size == 2**16] == [2**16]
+        assert len(written) <= 3
+        written.clear()
+        assert_same(StateStore(tmp_path).load()[1], {"rows": rows})
+
+
+def test_blocks_that_vanish_or_shrink_under_a_training_are_written_again(tmp_path):
+    store = StateStore(tmp_path)
+    for step in (1, 2):
+        store.save(step, state_of(0))
+    first, second = sorted((tmp_path / "blocks-0").iterdir())[:2]
+    first.unlink()
+    second.write_bytes(b"")
+    store.save(3, state_of(0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert StateStore(tmp_path).load()[0] == 3
+
+
+def test_what_was_verified_once_is_not_read_again(tmp_path, monkeypatch):
+    store = StateStore(tmp_path)
+    for step in (1, 2):
+        store.save(step, state_of(0))
+    read = []
+    read_bytes = store_module.Path.read_bytes
+    monkeypatch.setattr(store_module.Path, "read_bytes", lambda path: read.append(path) or read_bytes(path))
+    store.save(3, state_of(0))
+    assert read
+    assert all(path.suffix == ".json" for path in read)
 
 
 def state_of(step):
@@ -130,10 +160,19 @@ def test_the_newest_are_kept_and_nothing_that_no_state_needs(tmp_path):
     for step in (1, 2, 3):
         store.save(step, state_of(step))
     assert store.steps() == [2, 3]
-    # Two large arrays, one that they share, and twice what small ones share
-    assert len(list((tmp_path / "blocks").iterdir())) == 5
+    # Two large arrays, and what small ones share
+    assert [len(list((tmp_path / blocks).iterdir())) for blocks in BLOCK_FOLDERS] == [3, 3]
     store.save(2, state_of(2))
     assert store.steps() == [2]
+    assert sum(len(list((tmp_path / blocks).iterdir())) for blocks in BLOCK_FOLDERS) == 3
+
+
+def test_a_folder_that_cannot_be_written_to_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"so that this was not written: '.*file/"):
+        StateStore(tmp_path / "file").prepare()
+    StateStore(tmp_path / "new").prepare()
+    assert list((tmp_path / "new").iterdir()) == []
 
 
 def test_an_empty_folder_is_named(tmp_path):
@@ -144,8 +183,10 @@ def test_an_empty_folder_is_named(tmp_path):
 def damages(content):
     """List the ways in which a file's content may be damaged."""
     yield None
-    for length in (0, 1, len(content) // 2, len(content) - 1):
-        yield content[:length]
+    # Among them the ends of the parts of a state's own file: its checksum, and its content
+    for length in (0, 1, 12, 76, 86, len(content) // 2, len(content) - 2, len(content) - 1):
+        if length < len(content):
+            yield content[:length]
     yield content + b"x"
     for place in sorted({0, 1, 5, len(content) // 3, len(content) // 2, len(content) - 2, len(content) - 1}):
         for bit in (0, 7):
@@ -160,7 +201,8 @@ def test_every_damaged_file_is_refused_by_name_and_the_older_state_is_used(tmp_p
     olds = {path.relative_to(intact) for path in intact.rglob("*")}
     StateStore(intact).save(2, state_of(2))
     news = [path.relative_to(intact) for path in intact.rglob("*") if path.is_file() and path.relative_to(intact) not in olds]
-    assert len(news) == 3
+    # The state's own file, two large arrays, one of them the same as before, and what small ones share
+    assert len(news) == 4
     for name in news:
         for number, content in enumerate(damages((intact / name).read_bytes())):
             folder = tmp_path / f"{name.name}-{number}"
@@ -195,7 +237,7 @@ def test_where_all_are_damaged_all_are_named(tmp_path):
         StateStore(tmp_path).load()
 
 
-@pytest.mark.parametrize("name", ["../../secret", "/etc/passwd", "A" * 64, "0" * 63])
+@pytest.mark.parametrize("name", ["../../secret", "../../" + "0" * 64, "/etc/passwd", "A" * 64, "0" * 63])
 def test_a_manifest_reaches_nothing_outside_of_its_folder(tmp_path, monkeypatch, name):
     StateStore(tmp_path).save(1, state_of(1))
     body = StateStore(tmp_path)._read_manifest(1)
@@ -216,8 +258,18 @@ class Killed(BaseException):
     """What no code handles."""
 
 
+def test_a_manifest_names_no_other_folder(tmp_path):
+    StateStore(tmp_path).save(1, state_of(1))
+    path = tmp_path / "state-000000000001.json"
+    content = path.read_text()[86:-2].replace('"blocks-0"', '"../blocks"')
+    path.write_text(f'{{"sha256": "{hashlib.sha256(content.encode()).hexdigest()}", "body": {content}}}\n')
+    with pytest.raises(ValueError, match=r"its blocks are not in one of blocks-0, blocks-1"):
+        StateStore(tmp_path).load()
+
+
+@pytest.mark.parametrize("keep", [1, 2])
 @pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), Killed()])
-def test_whichever_operation_fails_a_whole_state_remains(tmp_path, monkeypatch, failure):
+def test_whichever_operation_fails_a_whole_state_remains(tmp_path, monkeypatch, failure, keep):
     """Let the first file operation fail, then the second, and so on, until a save has no more of them."""
     number = 0
     while True:
@@ -238,20 +290,18 @@ def test_whichever_operation_fails_a_whole_state_remains(tmp_path, monkeypatch, 
             for name in ("fsync", "replace", "unlink", "open"):
                 patch.setattr(os, name, failing(getattr(os, name)))
             patch.setattr("builtins.open", failing(open))
-            try:
-                StateStore(folder, keep=1).save(2, state_of(2))
-                has_failed = False
-            except type(failure):
-                has_failed = True
+            # Not every failure ends the saving: what is left over may stay
+            with contextlib.suppress(type(failure)):
+                StateStore(folder, keep).save(2, state_of(2))
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             step, found = StateStore(folder).load()
         assert_same(found, state_of(step))
-        StateStore(folder, keep=1).save(3, state_of(3))
+        StateStore(folder, keep).save(3, state_of(3))
         assert not [path for path in folder.rglob("*") if "partial" in path.name]
-        assert len(list((folder / "blocks").iterdir())) == 3
+        assert len(list(folder.glob("blocks-?/*"))) == 3 * keep
         number += 1
-        if not has_failed:
+        if left[0] >= 0:
             break
     assert number > 12
 
@@ -296,16 +346,18 @@ def test_killed_while_saving(tmp_path):
                     StateStore(tmp_path).save(step, state_of(step))
             finally:
                 os._exit(1)
-        time.sleep(draw.uniform(0.01, 0.12))
+        # However slow the machine is, it gets further
+        while max(StateStore(tmp_path).steps(), default=0) <= newest:
+            time.sleep(0.001)
+        time.sleep(draw.uniform(0.0, 0.1))
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-        if StateStore(tmp_path).steps():
-            with warnings.catch_warnings():
-                warnings.simplefilter("error")
-                step, found = StateStore(tmp_path).load()
-            assert step >= newest
-            newest = step
-            assert_same(found, state_of(step))
-    assert newest > 30
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            step, found = StateStore(tmp_path).load()
+        assert step > newest
+        newest = step
+        assert_same(found, state_of(step))
+    assert newest >= 30
     StateStore(tmp_path).save(newest + 1, state_of(newest + 1))
     assert not list(tmp_path.rglob(".partial*"))

@@ -94,14 +94,17 @@ def test_the_other_scripts_of_rl_zoo3_find_what_they_look_for(tmp_path, run_of):
     run = run_of(**TINY, normalize=True)
     folder = run_folder(tmp_path, "study", run)
     trained(run, folder)
-    forget_states(folder)
     assert folder == tmp_path / "study" / "M" / "td3" / "Pendulum-v1_4"
     found = run_in(folder)
     assert (found.read_yaml("config.yml")["batch_size"], found.read_yaml("args.yml")["seed"]) == (8, 3)
     hyperparams, stats_path = get_saved_hyperparams(str(found.settings_folder), norm_reward=False)
     assert hyperparams["normalize"]
     assert stats_path == str(found.settings_folder)
+    # States are kept until the study knows of the run's end
+    assert (folder / "state").exists()
+    forget_states(folder)
     assert not (folder / "state").exists()
+    assert found.model_path.is_file()
 
 
 def test_what_is_trained_is_what_the_sweep_says(tmp_path, run_of):

@@ -22,7 +22,7 @@ class Interruption(Exception):
 
 class Stop(BaseCallback):
     """
-    Interrupts the training.
+    Interrupts the training. On the way it draws from Python's generator, and logs the mean since it was last written.
 
     :param step: at which environment step; None for never
     """
@@ -32,6 +32,7 @@ class Stop(BaseCallback):
         self.step = step
 
     def _on_step(self):
+        self.logger.record_mean("random/mean", random.random())
         if self.step is not None and self.num_timesteps >= self.step:
             raise Interruption
         return True
@@ -60,12 +61,15 @@ class Training:
     :param normalises: whether VecNormalize is around them
     :param steps: the training's length
     :param save_freq: steps between two states
+    :param eval_freq: steps between two evaluations
     :param arguments: CGP's arguments
     """
 
-    def __init__(self, folder, env="Pendulum-v1", n_envs=1, normalises=False, steps=120, save_freq=10, **arguments):
+    def __init__(
+        self, folder, env="Pendulum-v1", n_envs=1, normalises=False, steps=120, save_freq=10, eval_freq=35, **arguments
+    ):
         self.folder, self.env, self.n_envs, self.normalises = Path(folder), env, n_envs, normalises
-        self.steps, self.save_freq, self.arguments = steps, save_freq, arguments
+        self.steps, self.save_freq, self.eval_freq, self.arguments = steps, save_freq, eval_freq, arguments
         self.written = Written()
 
     def make_env(self, seed, trains=True):
@@ -95,7 +99,7 @@ class Training:
         self.evaluation = EvalCallback(
             self.make_env(seed=2 if model.resumption is None else 200, trains=False),
             n_eval_episodes=1,
-            eval_freq=max(35 // self.n_envs, 1),
+            eval_freq=max(self.eval_freq // self.n_envs, 1),
             log_path=str(self.folder),
             verbose=0,
         )
@@ -122,7 +126,9 @@ def fingerprint(training, model):
     found["best"] = np.array(training.evaluation.best_mean_reward)
     if model.get_vec_normalize_env() is not None:
         normalizer = model.get_vec_normalize_env()
-        found |= {"mean": normalizer.obs_rms.mean, "var": normalizer.ret_rms.var, "returns": normalizer.returns}
+        statistics = normalizer.obs_rms if isinstance(normalizer.obs_rms, dict) else {"": normalizer.obs_rms}
+        found |= {f"mean.{key}": each.mean for key, each in statistics.items()}
+        found |= {"var": normalizer.ret_rms.var, "returns": normalizer.returns}
     return found
 
 

@@ -1,8 +1,11 @@
-"""The files of SB3's monitors, which a training that goes on must go on in."""
+"""SB3's logs, which a training that goes on must go on in: the files of monitors, and TensorBoard's events."""
 
 import json
 import os
 from pathlib import Path
+
+from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat, make_output_format
+from torch.utils.tensorboard import SummaryWriter
 
 
 def read_start(path: Path) -> float:
@@ -34,3 +37,24 @@ def cut_monitors(path: Path, n_episodes: int | None, n_steps: int) -> None:
             length += int(row.split(b",")[column])
             n_episodes += length <= n_steps
     os.truncate(path, sum(map(len, [*lines[:2], *rows[:n_episodes]])))
+
+
+def continued_logger(folder: str, first_step: int, verbose: int) -> Logger:
+    """
+    Make the logger that SB3 makes for TensorBoard, in a folder that has events.
+
+    :param folder: the folder
+    :param first_step: from which step on TensorBoard hides what is there: it is about to come again
+    :param verbose: whether it prints, too
+    :return: the logger
+    """
+    outputs: list[KVWriter] = [make_output_format("stdout", folder)] if verbose >= 1 else []
+    return Logger(folder, [*outputs, _ContinuedTensorBoard(folder, first_step)])
+
+
+class _ContinuedTensorBoard(TensorBoardOutputFormat):
+    """SB3's writer for TensorBoard, whose constructor makes one that purges nothing."""
+
+    def __init__(self, folder: str, first_step: int):
+        self.writer = SummaryWriter(log_dir=folder, purge_step=first_step)
+        self._is_closed = False

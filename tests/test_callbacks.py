@@ -1,0 +1,248 @@
+"""The callback that saves states: its folder, its signal, and what it refuses before a training begins."""
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.env_util import make_vec_env
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from trainings import SMALL
+
+from sb3_cgp import CGP
+from sb3_cgp.callbacks import TrainingCheckpointCallback
+from sb3_cgp.store import StateStore
+
+
+def make_model(**arguments):
+    arguments = dict(env=make_vec_env("Pendulum-v1", seed=1), policy_kwargs=dict(net_arch=[8])) | SMALL | arguments
+    return CGP("MlpPolicy", **arguments)
+
+
+class Do(BaseCallback):
+    """Calls a function at a step, of the environment or, offline, of the policy's training."""
+
+    def __init__(self, step, function):
+        super().__init__()
+        self.step, self.function = step, function
+
+    def _on_step(self):
+        if self.n_calls == self.step:
+            self.function()
+        return True
+
+
+def terminate():
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.fixture(autouse=True)
+def handler():
+    """SIGTERM's handler, which every training must leave as it was."""
+    handler = signal.getsignal(signal.SIGTERM)
+    yield handler
+    left, _ = signal.getsignal(signal.SIGTERM), signal.signal(signal.SIGTERM, handler)
+    assert left is handler
+
+
+# The folder
+
+
+def test_the_states_of_another_training_are_not_touched_by_a_resumed_one_either(tmp_path):
+    make_model().learn(30, TrainingCheckpointCallback(10, tmp_path / "one"))
+    make_model(seed=1).learn(60, TrainingCheckpointCallback(10, tmp_path / "other"))
+    model = CGP.resume(tmp_path / "one", make_vec_env("Pendulum-v1"))
+    with pytest.raises(ValueError, match=r"`path` is '.*other', but must be a folder without the states of another training"):
+        model.learn(50, TrainingCheckpointCallback(10, tmp_path / "other"))
+    assert StateStore(tmp_path / "other").steps() == [50, 60]
+    model.learn(50, TrainingCheckpointCallback(10, tmp_path / "new"))
+    assert StateStore(tmp_path / "new").load()[0] == 50
+
+
+def test_several_callbacks_save_to_folders_of_their_own(tmp_path):
+    model = make_model()
+    callbacks = [
+        TrainingCheckpointCallback(10, tmp_path / "often"),
+        TrainingCheckpointCallback(20, tmp_path / "seldom", keep=9),
+    ]
+    model.learn(50, callbacks)
+    model.learn(40, callbacks, reset_num_timesteps=False)
+    assert StateStore(tmp_path / "often").steps() == [80, 90]
+    assert StateStore(tmp_path / "seldom").steps() == [20, 40, 50, 60, 80, 90]
+
+
+def test_a_folder_that_cannot_be_written_to_is_noticed_before_the_training(tmp_path):
+    (tmp_path / "file").write_text("")
+    model = make_model()
+    with pytest.raises(OSError, match=r"so that this was not written: '.*file/"):
+        model.learn(30, TrainingCheckpointCallback(10, tmp_path / "file"))
+    assert model.num_timesteps == 0
+
+
+@pytest.mark.parametrize(
+    "nest",
+    [
+        lambda callback: EveryNTimesteps(10, callback),
+        lambda callback: EveryNTimesteps(10, CallbackList([callback])),
+        lambda callback: EvalCallback(make_vec_env("Pendulum-v1"), callback_on_new_best=callback),
+    ],
+    ids=["event", "list", "best"],
+)
+def test_within_another_callback_it_is_refused(nest, tmp_path):
+    model = make_model()
+    with pytest.raises(
+        ValueError, match=r"`parent` is .*, but must be None: give a TrainingCheckpointCallback to `learn` itself"
+    ):
+        model.learn(30, nest(TrainingCheckpointCallback(10, tmp_path)))
+    assert model.num_timesteps == 0
+
+
+class Prioritised(ReplayBuffer):
+    """A buffer of somebody's own, with more to it than rows."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.priorities = np.ones(self.buffer_size)
+
+
+class Tree(Prioritised):
+    """With a part that is no plain data."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.tree = object()
+
+
+def test_a_replay_buffer_is_saved_with_all_of_its_state_or_refused(tmp_path):
+    model = make_model(replay_buffer_class=Prioritised)
+    model.replay_buffer.priorities[3] = 7.0
+    model.learn(30, TrainingCheckpointCallback(10, tmp_path / "plain"))
+    resumed = CGP.resume(tmp_path / "plain", make_vec_env("Pendulum-v1"))
+    assert np.array_equal(resumed.replay_buffer.priorities, model.replay_buffer.priorities)
+    with pytest.raises(ValueError, match=r"`replay_buffer\.tree` is <object .*, but must be plain data or an array where"):
+        make_model(replay_buffer_class=Tree).learn(30, TrainingCheckpointCallback(10, tmp_path / "tree"))
+
+
+# The signal
+
+
+@pytest.mark.parametrize("at", [1, 15, 33, 50], ids=["first step", "random steps", "within", "last step"])
+def test_sigterm_ends_the_training_with_its_state_whenever_it_comes(at, tmp_path):
+    callbacks = [TrainingCheckpointCallback(10, tmp_path), TrainingCheckpointCallback(10, tmp_path / "second")]
+    with pytest.raises(SystemExit, match="143"):
+        make_model().learn(50, [*callbacks, Do(at, terminate)])
+    assert StateStore(tmp_path).load()[0] == at
+    expected = make_model().learn(50)
+    assert parameters_equal(CGP.resume(tmp_path, make_vec_env("Pendulum-v1")).learn(50), expected)
+
+
+def test_sigterm_ends_the_offline_training_of_a_policy(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_cgp.offline.ROUND", 10)
+    with pytest.raises(SystemExit, match="143"):
+        make_model(policy_training="offline").learn(40, [TrainingCheckpointCallback(10, tmp_path), Do(55, terminate)])
+    resumed = CGP.resume(tmp_path, make_vec_env("Pendulum-v1"))
+    assert not resumed._policy_is_trained
+    assert resumed.num_timesteps == 40
+    assert parameters_equal(resumed.learn(40), make_model(policy_training="offline").learn(40))
+
+
+@pytest.mark.parametrize("at", [20, 55], ids=["critics", "policy"])
+def test_sigterm_during_an_evaluation(at, tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_cgp.offline.ROUND", 10)
+
+    def make(trains):
+        env = make_vec_env("Pendulum-v1", seed=2)
+        evaluation = EvalCallback(env, eval_freq=5, n_eval_episodes=1, verbose=0)
+        if trains is False:
+            # In the middle of the episode
+            step, steps = env.step_wait, iter(range(1000))
+            env.step_wait = lambda: (evaluation.n_calls == at and next(steps) == 9 and terminate()) or step()
+        return evaluation
+
+    stopped = make(False)
+    with pytest.raises(SystemExit, match="143"):
+        make_model(policy_training="offline").learn(40, [TrainingCheckpointCallback(10, tmp_path), stopped])
+    assert StateStore(tmp_path).load()[0] == min(at, 40)
+    straight, resumed = make(True), make(True)
+    expected = make_model(policy_training="offline").learn(40, straight)
+    model = CGP.resume(tmp_path, make_vec_env("Pendulum-v1"))
+    assert parameters_equal(model.learn(40, [TrainingCheckpointCallback(10, tmp_path), resumed]), expected)
+    assert (resumed.best_mean_reward, resumed.last_mean_reward) == (straight.best_mean_reward, straight.last_mean_reward)
+
+
+def parameters_equal(one, other):
+    pairs = zip(one.policy.state_dict().values(), other.policy.state_dict().values(), strict=True)
+    return all(ours.equal(theirs) for ours, theirs in pairs)
+
+
+def test_processes_forked_during_the_training_end_by_sigterm(tmp_path):
+    ended = []
+    context = multiprocessing.get_context("fork")
+    is_running = context.Event()
+
+    def run():
+        is_running.set()
+        time.sleep(60)
+
+    def fork():
+        process = context.Process(target=run)
+        process.start()
+        # Python forgets a signal that comes while it forks
+        assert is_running.wait(30)
+        process.terminate()
+        process.join(30)
+        ended.append(process.exitcode)
+        process.kill()
+
+    make_model().learn(30, [TrainingCheckpointCallback(10, tmp_path), Do(20, fork)])
+    assert ended == [-signal.SIGTERM]
+
+
+def test_a_second_sigterm_acts_as_before(tmp_path, handler):
+    seen = []
+    signal.signal(signal.SIGTERM, lambda *_: seen.append("before"))
+    try:
+        with pytest.raises(SystemExit, match="143"):
+            make_model().learn(50, [TrainingCheckpointCallback(10, tmp_path), Do(33, terminate), Do(33, terminate)])
+        assert seen == ["before"]
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+
+
+def test_in_another_thread_states_are_saved_and_signals_left_alone(tmp_path):
+    thread = threading.Thread(target=lambda: make_model().learn(30, TrainingCheckpointCallback(10, tmp_path)))
+    thread.start()
+    thread.join()
+    assert StateStore(tmp_path).load()[0] == 30
+
+
+# The log
+
+
+def test_tensorboard_goes_on_in_the_trainings_own_folder(tmp_path):
+    logs = str(tmp_path / "logs")
+    arguments = dict(env="Pendulum-v1", tensorboard_log=logs)
+    make_model(**arguments).learn(800, log_interval=1)
+    stop = Do(690, lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        make_model(**arguments).learn(800, [TrainingCheckpointCallback(210, tmp_path / "state"), stop], log_interval=1)
+    # The newest folder is another's
+    make_model(**arguments).learn(30)
+    # TensorBoard puts a folder's files into the order of the second in their names
+    time.sleep(1)
+    model = CGP.resume(tmp_path / "state", "Pendulum-v1").learn(800, log_interval=1)
+    assert model.logger.dir == f"{logs}/CGP_2"
+    curves = []
+    for name in ("CGP_1", "CGP_2"):
+        events = EventAccumulator(f"{logs}/{name}").Reload()
+        tags = [tag for tag in events.Tags()["scalars"] if not tag.startswith("time/")]
+        curves.append({tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in tags})
+    assert curves[0] == curves[1]
+    assert len(curves[0]["rollout/ep_rew_mean"]) == 4
+    # A training after it has a folder of its own
+    assert model.learn(200, log_interval=1).logger.dir == f"{logs}/CGP_4"
