@@ -82,6 +82,16 @@ def _make_transactions_exclusive(storage: RDBStorage) -> None:
     storage.engine.dispose()
 
 
+def reason_of(error: BaseException) -> str:
+    """
+    Say why a storage does not answer.
+
+    :param error: one of ``STORAGE_ERRORS``
+    :return: its first line, without Optuna's words around it
+    """
+    return str(error.__cause__ or error).splitlines()[0]
+
+
 def patiently(call: Callable[..., Result], *args: Any, patience: float = 300.0, **kwargs: Any) -> Result:
     """
     Ask a storage again and again while its database does not answer.

@@ -23,7 +23,7 @@ from benchmark.figures import figures, study_folders
 from benchmark.processes import share_of_cores, start_workers, stop, terminate
 from benchmark.progress import Tally, display
 from benchmark.provenance import conditions
-from benchmark.storages import DEFAULT_STORAGE, open_storage
+from benchmark.storages import DEFAULT_STORAGE, STORAGE_ERRORS, open_storage, reason_of
 from benchmark.studies import Ledger
 from benchmark.sweep_files import SweepError
 from benchmark.worker import BEAT, GRACE
@@ -213,6 +213,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         folders = [run(sweep, study_name(sweep, args), args, argv) for sweep in sweeps]
     except (SweepError, ValueError) as error:
         sys.exit(f"Error: {error}")
+    except STORAGE_ERRORS as error:
+        sys.exit(f"Error: the storage does not answer: {reason_of(error)}. When it does, the same command goes on.")
     except KeyboardInterrupt:
         sys.exit(128 + signal.SIGINT)
     print(f"The page is {figures(sorted({*folders, *study_folders(args.results)}), args.results)}")

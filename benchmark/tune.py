@@ -21,7 +21,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from benchmark.arguments import count, hyperparameter
 from benchmark.entries import base_entry, write_entry
 from benchmark.processes import TERMINATED, listen, share_of_cores, start_workers, stop, terminate
-from benchmark.storages import DEFAULT_STORAGE, open_storage, patiently
+from benchmark.storages import DEFAULT_STORAGE, STORAGE_ERRORS, open_storage, patiently, reason_of
 from benchmark.studies import ERROR
 from benchmark.sweep_files import SweepError, known_task
 from benchmark.tuning import PRUNERS, SCORES, SCORING, Tuner, Tuning, best_of, is_over
@@ -211,6 +211,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             write_entry(args.write, args.env, entry, said)
     except (SweepError, ValueError) as error:
         sys.exit(f"Error: {error}")
+    except STORAGE_ERRORS as error:
+        sys.exit(f"Error: the storage does not answer: {reason_of(error)}. When it does, the same command goes on.")
     except KeyboardInterrupt:
         sys.exit(128 + signal.SIGINT)
 

@@ -147,3 +147,51 @@ def test_resumable_changes_nothing_else():
     plain, with_states = (each("MlpPolicy", "Pendulum-v1", **arguments).learn(60) for each in (TD3, resumable(TD3)))
     for name, value in plain.policy.state_dict().items():
         np.testing.assert_array_equal(with_states.policy.state_dict()[name], value, err_msg=name)
+
+
+def test_a_run_is_not_taken_up_from_the_states_of_another(tmp_path, run_of):
+    """... which a study of the same name has left, in a storage that is gone."""
+    with pytest.raises(Interruption):
+        train(run_of(**TINY), tmp_path / "used", lambda step, value: None, interrupt_at(200), "cpu")
+    run = run_of(**TINY, learning_rate=0.01)
+    assert trained(run, tmp_path / "used") == trained(run, tmp_path / "fresh")
+
+
+def interrupt_at(step):
+    def watch(timestep):
+        if timestep >= step:
+            raise Interruption
+
+    return watch
+
+
+def test_a_run_that_was_interrupted_after_its_last_step_has_its_whole_curve(tmp_path, run_of, monkeypatch):
+    run = run_of("cgp", **TINY, cem_samples=8, cem_elites=2)
+    straight = trained(run, tmp_path / "straight")
+
+    def stop(*args):
+        raise Interruption
+
+    with monkeypatch.context() as patch:
+        patch.setattr("benchmark.run._final_return", stop)
+        with pytest.raises(Interruption):
+            train(run, tmp_path / "stopped", lambda step, value: None, lambda step: None, "cpu")
+    assert trained(run, tmp_path / "stopped") == straight
+
+
+def test_a_tuned_method_goes_on_with_what_the_tasks_entry_says(tmp_path, run_of, monkeypatch):
+    """... of normalization, say, which is no argument of the algorithm."""
+    entry = {"n_timesteps": 500, "policy": "MlpPolicy", "normalize": True}
+    monkeypatch.setattr("sb3_cgp.zoo.hyperparams_folder", lambda: tmp_path)
+    (tmp_path / "cgp.yml").write_text(yaml.safe_dump({"Pendulum-v1": entry}))
+    run = run_of("cgp", tuned=True, **TINY, cem_samples=8, cem_elites=2)
+    straight = trained(run, tmp_path / "straight")
+    assert run_in(tmp_path / "straight").read_yaml("config.yml")["normalize"]
+    assert trained(run, tmp_path / "stopped", 130, 390) == straight
+
+
+def test_a_final_return_that_is_no_number_is_a_failure(tmp_path, run_of, monkeypatch):
+    # Optuna's databases could not read it again
+    monkeypatch.setattr("benchmark.run.evaluate_policy", lambda *args, **kwargs: ([1.0, np.nan], [200, 200]))
+    with pytest.raises(FloatingPointError, match="mean return is nan"):
+        trained(run_of(**TINY), tmp_path)

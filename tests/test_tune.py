@@ -332,10 +332,12 @@ def test_a_study_is_not_opened_with_other_settings(work, pretend):
         (["--conf-file", "others.yml"], "Hyperparameters not found"),
         (["--conf-file", "objects.py"], "The hyperparameters of td3 for Pendulum-v1 are no plain data"),
         (["--storage", "studies.db"], "must be a database's URL"),
+        (["--storage", "postgresql://127.0.0.1:1/x"], r"Error: the storage does not answer: .*127\.0\.0\.1.*goes on\."),
     ],
 )
 def test_mistakes_end_the_command(tmp_path, monkeypatch, argv, message):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("benchmark.storages.TABLES_TIMEOUT", 0.0)
     Path("others.yml").write_text("Reacher-v5: {gamma: 0.9}")
     Path("objects.py").write_text("hyperparams = {'default': {'policy': object()}}")
     with pytest.raises(SystemExit, match=message):
