@@ -1,6 +1,8 @@
 """A study's runs as small text files, for figures and to be kept in a repository."""
 
 import json
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,26 @@ from benchmark.sweep_files import SweepError
 STUDY = "study.json"
 # Of what benchmark.provenance says
 CONDITIONS = ("command", "commit", "versions", "machine", "load_average")
+
+
+# Options that say where files and databases are, and may hold a password
+PRIVATE = ("--storage", "--logs", "--results")
+
+
+def without_places(argv: Sequence[str]) -> list[str]:
+    """
+    Leave out of a command line what is of no influence on results, and no one else's business.
+
+    :param argv: the arguments
+    :return: those without the places of files and databases
+    """
+    kept: list[str] = []
+    for argument in argv:
+        if kept and kept[-1] in PRIVATE:
+            kept.pop()
+        elif not argument.startswith(tuple(f"{option}=" for option in PRIVATE)):
+            kept.append(argument)
+    return kept
 
 
 def export_study(name: str, storage_url: str, results: Path) -> Path:
@@ -53,4 +75,5 @@ def ended_runs(folder: Path, description: dict[str, Any]) -> tuple[list[Record],
             same = was[key] == now
         if not same:
             raise SweepError(folder / STUDY, key, "differs from the sweep's, so that its runs cannot be adopted")
-    return read_records(folder), [*was.get("earlier", []), {key: was[key] for key in CONDITIONS}]
+    conditions = {key: was[key] for key in CONDITIONS} | {"command": shlex.join(without_places(shlex.split(was["command"])))}
+    return read_records(folder), [*was.get("earlier", []), conditions]

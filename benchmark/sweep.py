@@ -18,7 +18,7 @@ import torch as th
 
 from benchmark.arguments import count, hyperparameter, output_folder
 from benchmark.experiments import Sweep, included_sweeps, load_sweep
-from benchmark.exports import ended_runs, export_study
+from benchmark.exports import ended_runs, export_study, without_places
 from benchmark.figures import figures, study_folders
 from benchmark.processes import share_of_cores, start_workers, stop, terminate
 from benchmark.progress import Tally, display
@@ -43,7 +43,9 @@ def describe(sweep: Sweep, argv: Sequence[str], device: str, threads: int = 1) -
     :return: plain data
     """
     file = sweep.file
-    circumstances = conditions("benchmark.sweep", argv, th.device("cpu") if device == "auto" else th.device(device))
+    circumstances = conditions(
+        "benchmark.sweep", without_places(argv), th.device("cpu") if device == "auto" else th.device(device)
+    )
     # Not this process's, which trains nothing
     circumstances["machine"]["torch_threads"] = threads
     return {

@@ -77,17 +77,18 @@ class CEM:
         :param device: the device on which ``score`` works
         :return: the selected actions (B, A) and the final spread (B, A)
         """
-        mean = th.zeros(n_states, action_dim, device=device)
-        std = th.ones(n_states, action_dim, device=device)
-        elites = mean.unsqueeze(1)
+        mean = th.zeros(n_states, 1, action_dim, device=device)
+        std = th.ones(n_states, 1, action_dim, device=device)
+        elites = mean
         for _ in range(self.iterations):
             noise = th.randn(n_states, self.samples, action_dim, device=device)
-            samples = th.addcmul(mean.unsqueeze(1), std.unsqueeze(1), noise)  # (B, N, A)
+            samples = th.addcmul(mean, std, noise)  # (B, N, A)
             values = score(th.tanh(samples))  # (B, N)
             values = values.nan_to_num(nan=-th.inf, posinf=th.inf, neginf=-th.inf)
             winners = values.topk(self.elites, dim=1).indices  # (B, K), best first
             elites = samples.gather(1, winners.unsqueeze(2).expand(-1, -1, action_dim))  # (B, K, A)
-            mean = elites.mean(dim=1)
+            mean = elites.mean(dim=1, keepdim=True)
             # Much faster here than `std`
-            std = (elites - mean.unsqueeze(1)).square().mean(dim=1).sqrt()
-        return Selection(actions=th.tanh(elites[:, 0] if self.result == "best" else mean), spread=std)
+            std = (elites - mean).square().mean(dim=1, keepdim=True).sqrt()
+        result = elites if self.result == "best" else mean
+        return Selection(actions=th.tanh(result[:, 0]), spread=std[:, 0])

@@ -14,7 +14,6 @@ from stable_baselines3.common.utils import (
     FloatSchedule,
     LinearSchedule,
     configure_logger,
-    get_parameters_by_name,
     polyak_update,
 )
 from stable_baselines3.common.vec_env import VecEnv
@@ -51,6 +50,11 @@ def _as_schedule(rate: float | Schedule | str) -> Schedule:
     if isinstance(rate, str):
         return LinearSchedule(float(rate.removeprefix(LINEAR_SCHEDULE_PREFIX)), 0.0, 1.0)
     return FloatSchedule(rate)
+
+
+def _running_statistics(network: th.nn.Module) -> list[th.Tensor]:
+    """List batch norm's running statistics."""
+    return [buffer for name, buffer in network.named_buffers() if "running_" in name]
 
 
 class CGP(ResumableAlgorithm, GradientAlgorithm):
@@ -398,8 +402,7 @@ class CGP(ResumableAlgorithm, GradientAlgorithm):
     def _update_average(self, network: th.nn.Module, average: th.nn.Module) -> None:
         """Move a Polyak average towards its network; batch norm's running statistics are copied (SB3 issue #996)."""
         polyak_update(network.parameters(), average.parameters(), self.tau)
-        running, average_running = (get_parameters_by_name(module, ["running_"]) for module in (network, average))
-        polyak_update(running, average_running, 1.0)
+        polyak_update(_running_statistics(network), _running_statistics(average), 1.0)
 
     def _update_actor_learning_rate(self, progress_remaining: float) -> None:
         rate = self.actor_lr_schedule(progress_remaining)

@@ -111,6 +111,16 @@ class CGPPolicy(TD3Policy):
             score = q_score(critic.q_networks[0], features, dtype)
             return self.selector.select(score, len(features), get_action_dim(self.action_space), features.device)
 
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        Put the actor and the critic in either training or evaluation mode, as TD3's policy does.
+
+        :param mode: if true, set to training mode, else set to evaluation mode
+        """
+        # Asked for at every prediction, and slow: it visits every module
+        if not self.training == self.actor.training == self.critic.training == mode:
+            super().set_training_mode(mode)
+
     @contextmanager
     def inferring_by(self, inference: str, select: Callable[..., Any] | None = None) -> Iterator[None]:
         """

@@ -17,6 +17,9 @@ from sb3_cgp.cem import Score
 # Hidden activations of one block, per thread: about what stays in a core's cache (1 MiB of float32)
 BLOCK_SIZE = 2**18
 
+# Bytes of a block of memory that makes the C library keep what is freed
+KEPT_MEMORY = 2**24
+
 # From which on another data type makes up for the operations that it adds
 MANY_STATES = 8
 
@@ -41,6 +44,18 @@ def _onednn_linear(dtype: th.dtype) -> Callable[..., th.Tensor] | None:
         except RuntimeError:
             return None
     return linear
+
+
+@functools.cache
+def _keep_freed_memory() -> None:
+    """
+    Have glibc, where it is the C library, keep freed memory for the next activations.
+
+    It hands blocks beyond a threshold back to the system, which costs more than a pass over them, as fresh memory comes a
+    page at a time. The threshold is the size of the largest such block freed so far, up to 32 MiB (see ``man mallopt``).
+    The block for that is never written, so that it takes no memory.
+    """
+    th.empty(KEPT_MEMORY, dtype=th.uint8)
 
 
 def scoring_dtype(setting: str, device: th.device) -> th.dtype:
@@ -75,6 +90,8 @@ def q_score(q_network: nn.Module, features: th.Tensor, dtype: th.dtype = th.floa
         and so is all where states are few, or where a network has other layers than linear ones and rectifiers between them.
     :return: the scoring function, (B, N, A) -> (B, N), without gradients
     """
+    if features.device.type == "cpu":
+        _keep_freed_memory()
     if not _begins_with_linear(q_network):
         return repeated_q_score(q_network, features)
     if dtype != th.float32 and len(features) >= MANY_STATES and _is_rectifier_network(q_network):
@@ -107,13 +124,13 @@ def _score_by_parts(q_network: nn.Sequential, features: th.Tensor) -> Score:
 
     @th.no_grad()
     def score(actions: th.Tensor) -> th.Tensor:
-        def score_block(block: slice, block_actions: th.Tensor) -> th.Tensor:
-            hidden = _multiply_each(block_actions, action_weight, state_part[block])
+        def score_block(block_actions: th.Tensor, block_state_part: th.Tensor) -> th.Tensor:
+            hidden = _multiply_each(block_actions, action_weight, block_state_part)
             for layer in layers:
                 hidden = layer(hidden)
             return hidden
 
-        return _in_blocks(score_block, actions, first.out_features)
+        return _in_blocks(score_block, first.out_features, actions, state_part)
 
     return score
 
@@ -134,7 +151,7 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
     @th.no_grad()
     def score(actions: th.Tensor) -> th.Tensor:
         common_actions = actions.mean(dim=1, keepdim=True)
-        common = [th.baddbmm(state_part, common_actions, action_weight.expand(len(actions), -1, -1)).squeeze(1)]  # (B, H) each
+        common = [th.addmm(state_part.squeeze(1), common_actions.squeeze(1), action_weight)]  # (B, H) each
         for layer in hidden:
             common.append(_multiply(common[-1].relu(), layer.weight, layer.bias))
         # The last hidden layer in fewer passes: relu(u + d) = u + max(d, -u)
@@ -142,16 +159,17 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
         offsets = [values.clamp(max=0.0).unsqueeze(1) for values in common[:-1]]
         floors = [values.relu().neg_().unsqueeze(1) for values in common[:-1]] + [common[-1].neg().unsqueeze(1)]
 
-        def score_block(block: slice, different_actions: th.Tensor) -> th.Tensor:
-            different = _multiply_each(different_actions, action_weight, offsets[0][block])
-            for index, weight in enumerate(weights, start=1):
-                rectified = _clamp_each(different, floors[index - 1][block])
+        def score_block(different_actions: th.Tensor, *of_states: th.Tensor) -> th.Tensor:
+            block_offsets, block_floors = of_states[: len(weights)], of_states[len(weights) :]
+            different = _multiply_each(different_actions, action_weight, block_offsets[0])
+            for index, weight in enumerate(weights):
+                if index > 0:
+                    different.unflatten(0, different_actions.shape[:2]).add_(block_offsets[index])
+                rectified = _clamp_each(different, block_floors[index])
                 different = _multiply(rectified.to(dtype), weight).to(actions.dtype)
-                if index < len(weights):
-                    different.unflatten(0, (-1, actions.shape[1])).add_(offsets[index][block])
-            return F.linear(_clamp_each(different, floors[-1][block]), last.weight)
+            return F.linear(_clamp_each(different, block_floors[-1]), last.weight)
 
-        return _in_blocks(score_block, actions - common_actions, width).add_(common_values)
+        return _in_blocks(score_block, width, actions - common_actions, *offsets, *floors).add_(common_values)
 
     return score
 
@@ -163,19 +181,24 @@ def _split(first: nn.Linear, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]
     return state_part, first.weight[:, n_features:].t().contiguous()
 
 
-def _in_blocks(score_block: Callable[[slice, th.Tensor], th.Tensor], actions: th.Tensor, width: int) -> th.Tensor:
-    """Score a block of states at a time: their indices and actions (b, N, A) -> their values, b N in all."""
+def _in_blocks(score_block: Callable[..., th.Tensor], width: int, actions: th.Tensor, *of_states: th.Tensor) -> th.Tensor:
+    """
+    Score a block of states at a time.
+
+    :param score_block: actions (b, N, A), and what belongs to their states -> their values, b N in all
+    :param width: units of the widest layer
+    :param actions: the actions, (B, N, A)
+    :param of_states: what belongs to the states, (B, ...) each
+    :return: the values, (B, N)
+    """
     n_states, n_actions, _ = actions.shape
     # Only a CPU gains from blocks: on a GPU one large product is the fastest
     rows = BLOCK_SIZE * th.get_num_threads() // width if actions.device.type == "cpu" else n_states * n_actions
     step = max(rows // n_actions, 1)
     if step >= n_states:
-        return score_block(slice(None), actions).view(n_states, n_actions)
-    values = actions.new_empty(n_states, n_actions)
-    for start in range(0, n_states, step):
-        block = slice(start, start + step)
-        values[block] = score_block(block, actions[block]).view(-1, n_actions)
-    return values
+        return score_block(actions, *of_states).view(n_states, n_actions)
+    blocks = zip(*(tensor.split(step) for tensor in (actions, *of_states)), strict=True)
+    return th.cat([score_block(*block) for block in blocks]).view(n_states, n_actions)
 
 
 def _multiply_each(actions: th.Tensor, weight: th.Tensor, addends: th.Tensor) -> th.Tensor:

@@ -198,6 +198,18 @@ def test_batch_norm_and_dropout_keep_their_modes_and_statistics():
         assert th.equal(model.policy.state_dict()[key], value)
 
 
+@pytest.mark.parametrize("name", ["actor", "critic", "policy"])
+def test_predicting_evaluates_whichever_network_was_left_in_training_mode(name):
+    model = make_model(policy_kwargs=dict(net_arch=[16], features_extractor_class=NormalisedDropout))
+    modules = list(model.policy.actor.modules()) + list(model.policy.critic.modules())
+    model.policy.set_training_mode(True)
+    assert all(module.training for module in modules)
+    for _ in range(2):
+        model.predict(np.zeros(3, np.float32))
+        assert not any(module.training for module in (model.policy, *modules))
+        getattr(model, name).train()
+
+
 def test_observations_pass_the_features_extractor_once_per_state_never_per_sample():
     model = make_model(policy_kwargs=dict(net_arch=[16], features_extractor_class=NormalisedDropout), cem_samples=32)
     extractor = model.critic.features_extractor

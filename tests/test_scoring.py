@@ -1,5 +1,8 @@
 """The fast way of scoring many actions against the plain one, and both against a matrix product at a time."""
 
+import platform
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import oracles
@@ -198,3 +201,30 @@ def test_without_onednn_scores_are_the_same(monkeypatch, reason):
 def test_the_private_function_exists_in_the_tested_pytorch():
     # Without it everything works, but no faster than MKL: the constraints' PyTorch should have it
     assert scoring._onednn_linear(th.float32) is not None or not th.backends.mkldnn.is_available()
+
+
+COUNT_FRESH_PAGES = """
+import resource
+import torch as th
+from stable_baselines3.common.torch_layers import create_mlp
+from sb3_cgp import CEM
+from sb3_cgp.scoring import q_score
+
+th.set_num_threads(2)
+network, features = th.nn.Sequential(*create_mlp(23, 1, [256, 256])), th.randn(128, 17)
+for dtype in (th.float32, th.bfloat16):
+    with th.no_grad():
+        for call in range(8):
+            if call == 3:
+                before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+            CEM().select(q_score(network, features, dtype), 128, 6)
+    print((resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) / 5)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries keep freed memory in their own way")
+def test_calls_take_no_fresh_memory_from_the_system():
+    # In a process of its own, as what is kept depends on all that a process has freed. A block of activations has 256 pages
+    counts = subprocess.run([sys.executable, "-c", COUNT_FRESH_PAGES], check=True, capture_output=True, text=True).stdout
+    assert all(float(count) < 128 for count in counts.split())
+    assert len(counts.split()) == 2

@@ -107,6 +107,12 @@ def test_runs_of_other_settings_are_not_adopted(tmp_path, ledger):
     assert ended_runs(tmp_path / "nothing", {}) == ([], [])
 
 
+def test_where_databases_are_is_not_recorded():
+    argv = ["e8", "--storage", "postgresql://me:secret@host/db", "--seeds", "1", "--logs=here", "--results", "there"]
+    sweep, _ = of_command_line(*SMALL)
+    assert describe(sweep, argv, "cpu")["command"] == "python -m benchmark.sweep e8 --seeds 1"
+
+
 def test_records_come_back(tmp_path):
     records = [
         Record("e3", "A", "Pendulum-v1", {"x": 0.5, "y": "z"}, 3, 10, [5, 10], [1.5, 2.0], 2.5, None, 1.0),
