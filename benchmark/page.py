@@ -76,7 +76,10 @@ def study_section(study: Study, pictures: Sequence[Picture], command: str, repet
         f"every {facts['evaluation_interval']:,} by {facts['evaluation_episodes']} episodes.",
         f"The runs: {conditions_in_words(facts)}",
         # Of a study that was gone on with
-        *(f"Earlier runs: {conditions_in_words(earlier)}" for earlier in facts.get("earlier", [])),
+        *(
+            f"{facts['runs_adopted']} of these runs were trained before: {conditions_in_words(earlier)}"
+            for earlier in facts.get("earlier", [])
+        ),
     ]
     if study.records:
         parts += [picture.in_words(command) for picture in pictures]
