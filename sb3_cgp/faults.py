@@ -70,16 +70,21 @@ def end_workers(env: SubprocVecEnv) -> None:
 
     :param env: the environment, whose ``close`` does nothing from now on
     """
+    _end_processes(env)
+    for remote in env.remotes:
+        remote.close()
+    env.waiting, env.closed = False, True
+
+
+def _end_processes(env: SubprocVecEnv) -> None:
     for process in env.processes:
         process.terminate()
     for process in env.processes:
         process.join(GRACE)
+        # A process that was forked after pygame had begun takes SIGTERM for an event
         if process.is_alive():
             process.kill()
             process.join()
-    for remote in env.remotes:
-        remote.close()
-    env.waiting, env.closed = False, True
 
 
 class BoundsWatch:
@@ -217,8 +222,7 @@ class _WorkerWatch:
         ready = connection.wait([self._stop_receiver, *(process.sentinel for process in self.env.processes)])
         if self._stop_receiver not in ready:
             self.dead = _dead_workers(self.env)
-            for process in self.env.processes:
-                process.terminate()
+            _end_processes(self.env)
 
     def wait(self, timeout: float = GRACE) -> list[int]:
         """

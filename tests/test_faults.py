@@ -120,6 +120,20 @@ def test_a_worker_that_is_killed_is_named_and_the_others_end(start_method, index
     assert_buried(env)
 
 
+def ignore_termination(*values):
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    return values
+
+
+def test_workers_that_do_not_heed_sigterm_are_ended_too(monkeypatch):
+    """Forked after pygame has begun, they take SIGTERM for an event, and hold the dead one's pipe open."""
+    monkeypatch.setattr("sb3_cgp.faults.GRACE", 0.5)
+    env = SubprocVecEnv([lambda: Failing(ignore_termination, at=1), lambda: Failing(kill_worker)], start_method="fork")
+    with pytest.raises(RuntimeError, match="worker 1"):
+        CGP("MlpPolicy", env, **SMALL).learn(300)
+    assert_buried(env)
+
+
 def test_an_exception_in_a_worker_is_printed_by_it_and_ends_the_training(capfd):
     env = subproc(None, raise_error)
     with pytest.raises(RuntimeError, match=r"at environment step 28: .* worker 1 .* ended with exit code 1\."):
