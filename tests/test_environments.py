@@ -372,6 +372,8 @@ def test_rendering_does_not_matter():
     env.reset()
     env.envs[0].render()
     assert environment_state(env) is not None
+    # Else pygame goes on to take SIGTERM for an event, in this process and in those that are forked off it
+    env.close()
 
 
 def test_a_user_may_decline_and_must_return_plain_data(monkeypatch):
