@@ -76,7 +76,7 @@ def test_train_from_a_fresh_clone(clone: Clone) -> None:
     assert ended.returncode == 0, ended.stderr
     assert calls[1:] == [
         "-m venv --clear .venv",
-        "-m pip install -c constraints.txt -e .",
+        "-m pip install -c constraints.txt -e .[benchmark]",
         "-m benchmark.plan --algo cgp --env Pendulum-v1 --folder logs",
         "-m rl_zoo3.train --algo cgp --env Pendulum-v1 --seed 0 --num-threads 1 --eval-freq 250 --eval-episodes 10 "
         "--log-folder logs --progress",
@@ -140,7 +140,7 @@ def test_changed_requirements_are_installed_over_the_environment(clone: Clone, n
     clone.touch(name)
     calls, _ = clone.make("lint")
     assert starting(calls, "-m pip") == [
-        "-m pip install -c constraints.txt -e .",
+        "-m pip install -c constraints.txt -e .[benchmark]",
         "-m pip install -c constraints.txt -e .[tests]",
     ]
     assert not starting(calls, "-m venv")
