@@ -24,7 +24,7 @@ class PlainPolicy(CGPPolicy):
 
         :param observation: a batch of B observations, as tensors
         :param critic: the critic, or the target critic
-        :return: the selected actions, (B, A), in the scaled action space, and the selector's final spread
+        :return: the selected actions, (B, A), in the scaled action space, and the selector's last elites
         """
         features = critic.extract_features(observation, critic.features_extractor)
         score = repeated_q_score(critic.q_networks[0], features)

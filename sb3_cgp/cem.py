@@ -20,11 +20,16 @@ class Selection(NamedTuple):
     What a selector found.
 
     :param actions: the selected actions, (B, A), within [-1, 1]
-    :param spread: standard deviation of the final sampling distribution, (B, A), before tanh
+    :param elites: the best of the last samples, (B, K, A), CEM's before tanh; how much they differ is how unsure it was
     """
 
     actions: th.Tensor
-    spread: th.Tensor
+    elites: th.Tensor
+
+    @property
+    def spread(self) -> th.Tensor:
+        """Standard deviation of the distribution that is fitted to the elites, (B, A)."""
+        return _fit(self.elites)[1].squeeze(1)
 
 
 class ActionSelector(Protocol):
@@ -75,20 +80,27 @@ class CEM:
         :param n_states: number of states, B
         :param action_dim: number of action dimensions, A
         :param device: the device on which ``score`` works
-        :return: the selected actions (B, A) and the final spread (B, A)
+        :return: the selected actions (B, A) and the last elites (B, K, A)
         """
-        mean = th.zeros(n_states, 1, action_dim, device=device)
-        std = th.ones(n_states, 1, action_dim, device=device)
-        elites = mean
-        for _ in range(self.iterations):
-            noise = th.randn(n_states, self.samples, action_dim, device=device)
-            samples = th.addcmul(mean, std, noise)  # (B, N, A)
-            values = score(th.tanh(samples))  # (B, N)
-            values = values.nan_to_num(nan=-th.inf, posinf=th.inf, neginf=-th.inf)
-            winners = values.topk(self.elites, dim=1).indices  # (B, K), best first
-            elites = samples.gather(1, winners.unsqueeze(2).expand(-1, -1, action_dim))  # (B, K, A)
-            mean = elites.mean(dim=1, keepdim=True)
-            # Much faster here than `std`
-            std = (elites - mean).square().mean(dim=1, keepdim=True).sqrt()
-        result = elites if self.result == "best" else mean
-        return Selection(actions=th.tanh(result[:, 0]), spread=std[:, 0])
+        # From the standard normal distribution
+        samples = th.randn(n_states, self.samples, action_dim, device=device)  # (B, N, A)
+        elites = self._select_elites(score, samples)
+        for _ in range(self.iterations - 1):
+            mean, std = _fit(elites)
+            samples = th.addcmul(mean, std, th.randn(n_states, self.samples, action_dim, device=device))
+            elites = self._select_elites(score, samples)
+        result = elites[:, 0] if self.result == "best" else elites.mean(dim=1)
+        return Selection(actions=th.tanh(result), elites=elites)
+
+    def _select_elites(self, score: Score, samples: th.Tensor) -> th.Tensor:
+        """Select the elites of samples before tanh, (B, N, A): (B, K, A), best first."""
+        values = score(th.tanh(samples)).nan_to_num(nan=-th.inf, posinf=th.inf, neginf=-th.inf)  # (B, N)
+        winners = values.topk(self.elites, dim=1).indices  # (B, K)
+        return samples.gather(1, winners.unsqueeze(2).expand(-1, -1, samples.shape[2]))
+
+
+def _fit(elites: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """Fit independent Gaussians to elites, (B, K, A): their mean and standard deviation, (B, 1, A) each."""
+    mean = elites.mean(dim=1, keepdim=True)
+    # Much faster here than `std`
+    return mean, (elites - mean).square().mean(dim=1, keepdim=True).sqrt()

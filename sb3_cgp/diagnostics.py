@@ -20,9 +20,10 @@ def policy_diagnostics(policy: CGPPolicy, observations: th.Tensor, has_actor: bo
         actions beyond a magnitude of 0.99; root mean squared distance of the actor's actions from CEM's (scaled, per
         dimension), and how much more Q-value the first critic gives to CEM's
     """
-    actions, spread = policy.select_actions(observations, policy.critic)
+    selection = policy.select_actions(observations, policy.critic)
+    actions = selection.actions
     figures = {
-        "train/cem_spread": spread.mean().item(),
+        "train/cem_spread": selection.spread.mean().item(),
         "train/saturated_actions": (actions.abs() > SATURATION).float().mean().item(),
     }
     if has_actor:

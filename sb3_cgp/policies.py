@@ -103,7 +103,7 @@ class CGPPolicy(TD3Policy):
 
         :param observation: a batch of B observations, as tensors
         :param critic: the critic, or the target critic
-        :return: the selected actions, (B, A), in the scaled action space, and the selector's final spread
+        :return: the selected actions, (B, A), in the scaled action space, and the selector's last elites
         """
         with _evaluation_mode(critic):
             features = critic.extract_features(observation, critic.features_extractor)

@@ -14,8 +14,8 @@ from torch.nn import functional as F
 
 from sb3_cgp.cem import Score
 
-# Hidden activations of one block, per thread: about what stays in a core's cache (1 MiB of float32)
-BLOCK_SIZE = 2**18
+# Hidden activations of one block: about what stays in the caches near one or two cores (2 MiB of float32)
+BLOCK_SIZE = 2**19
 
 # Bytes of a block of memory that makes the C library keep what is freed
 KEPT_MEMORY = 2**24
@@ -79,7 +79,7 @@ def _has_native_bfloat16() -> bool:
 
 def q_score(q_network: nn.Module, features: th.Tensor, dtype: th.dtype = th.float32) -> Score:
     """
-    Make the function that scores actions by a Q-network, given the states' features.
+    Make the function that scores actions by a Q-network, given the states' features. Call it without gradients.
 
     Networks that begin with a linear layer, as all of SB3's do, are scored without repeating the features for
     every action: ``W [s, a] + b = (W_s s + b) + W_a a``, whose first part is computed once per state.
@@ -94,7 +94,7 @@ def q_score(q_network: nn.Module, features: th.Tensor, dtype: th.dtype = th.floa
         _keep_freed_memory()
     if not _begins_with_linear(q_network):
         return repeated_q_score(q_network, features)
-    if dtype != th.float32 and len(features) >= MANY_STATES and _is_rectifier_network(q_network):
+    if dtype != th.float32 and features.shape[0] >= MANY_STATES and _is_rectifier_network(q_network):
         return _score_by_differences(q_network, features, dtype)
     return _score_by_parts(q_network, features)
 
@@ -122,7 +122,6 @@ def _score_by_parts(q_network: nn.Sequential, features: th.Tensor) -> Score:
     state_part, action_weight = _split(first, features)
     layers = _prepare(following)
 
-    @th.no_grad()
     def score(actions: th.Tensor) -> th.Tensor:
         def score_block(block_actions: th.Tensor, block_state_part: th.Tensor) -> th.Tensor:
             hidden = _multiply_each(block_actions, action_weight, block_state_part)
@@ -137,7 +136,7 @@ def _score_by_parts(q_network: nn.Sequential, features: th.Tensor) -> Score:
 
 def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: th.dtype) -> Score:
     """
-    Score by a network of linear layers and rectifiers, the products of whose hidden layers are in another data type.
+    Score by a network of linear layers and rectifiers, whose hidden layers compute in a data type of 16 bits.
 
     ``relu(u + d) = relu(u) + max(d + min(u, 0), -relu(u))``, where u is what a unit has for the mean of a state's actions,
     and d by how much it differs for one of them. What follows from u is computed once per state, in float32. Only
@@ -145,10 +144,10 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
     """
     first, *hidden, last = [module for module in q_network if _is_linear(module)]
     state_part, action_weight = _split(first, features)
-    weights = [layer.weight.to(dtype) for layer in hidden]
+    # The first of them is given differences with their signs turned
+    weights = [-hidden[0].weight.to(dtype), *(layer.weight.to(dtype) for layer in hidden[1:])]
     width = max(layer.out_features for layer in (first, *hidden))
 
-    @th.no_grad()
     def score(actions: th.Tensor) -> th.Tensor:
         common_actions = actions.mean(dim=1, keepdim=True)
         common = [th.addmm(state_part.squeeze(1), common_actions.squeeze(1), action_weight)]  # (B, H) each
@@ -156,20 +155,28 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
             common.append(_multiply(common[-1].relu(), layer.weight, layer.bias))
         # The last hidden layer in fewer passes: relu(u + d) = u + max(d, -u)
         common_values = F.linear(common[-1], last.weight, last.bias)
-        offsets = [values.clamp(max=0.0).unsqueeze(1) for values in common[:-1]]
-        floors = [values.relu().neg_().unsqueeze(1) for values in common[:-1]] + [common[-1].neg().unsqueeze(1)]
+        # The first one, with its sign turned: min(-d - min(u, 0), relu(u)), whose first part is one product
+        different_actions = F.pad(common_actions - actions, (0, 1), value=1.0).to(dtype)  # (B, N, A + 1)
+        first_weights = th.cat([action_weight.expand(len(actions), -1, -1), -common[0].clamp(max=0.0).unsqueeze(1)], dim=1).to(
+            dtype
+        )  # (B, A + 1, H)
+        ceilings = common[0].relu().to(dtype).unsqueeze(1)
+        offsets = [values.clamp(max=0.0).unsqueeze(1) for values in common[1:-1]]
+        floors = [values.relu().neg_().unsqueeze(1) for values in common[1:-1]] + [common[-1].neg().unsqueeze(1)]
 
-        def score_block(different_actions: th.Tensor, *of_states: th.Tensor) -> th.Tensor:
-            block_offsets, block_floors = of_states[: len(weights)], of_states[len(weights) :]
-            different = _multiply_each(different_actions, action_weight, block_offsets[0])
-            for index, weight in enumerate(weights):
-                if index > 0:
-                    different.unflatten(0, different_actions.shape[:2]).add_(block_offsets[index])
-                rectified = _clamp_each(different, block_floors[index])
-                different = _multiply(rectified.to(dtype), weight).to(actions.dtype)
-            return F.linear(_clamp_each(different, block_floors[-1]), last.weight)
+        def score_block(
+            block_actions: th.Tensor, first_weight: th.Tensor, block_ceilings: th.Tensor, *of_states: th.Tensor
+        ) -> th.Tensor:
+            block_offsets, block_floors = of_states[: len(offsets)], of_states[len(offsets) :]
+            rounded = _lower_each(th.bmm(block_actions, first_weight), block_ceilings).flatten(0, 1)
+            different = _multiply(rounded, weights[0]).to(actions.dtype)
+            for weight, block_offset, block_floor in zip(weights[1:], block_offsets, block_floors, strict=False):
+                different.unflatten(0, block_actions.shape[:2]).add_(block_offset)
+                different = _multiply(_raise_each(different, block_floor).to(dtype), weight).to(actions.dtype)
+            return F.linear(_raise_each(different, block_floors[-1]), last.weight)
 
-        return _in_blocks(score_block, width, actions - common_actions, *offsets, *floors).add_(common_values)
+        values = _in_blocks(score_block, width, different_actions, first_weights, ceilings, *offsets, *floors)
+        return values.add_(common_values)
 
     return score
 
@@ -193,7 +200,7 @@ def _in_blocks(score_block: Callable[..., th.Tensor], width: int, actions: th.Te
     """
     n_states, n_actions, _ = actions.shape
     # Only a CPU gains from blocks: on a GPU one large product is the fastest
-    rows = BLOCK_SIZE * th.get_num_threads() // width if actions.device.type == "cpu" else n_states * n_actions
+    rows = BLOCK_SIZE // width if actions.device.type == "cpu" else n_states * n_actions
     step = max(rows // n_actions, 1)
     if step >= n_states:
         return score_block(actions, *of_states).view(n_states, n_actions)
@@ -203,13 +210,25 @@ def _in_blocks(score_block: Callable[..., th.Tensor], width: int, actions: th.Te
 
 def _multiply_each(actions: th.Tensor, weight: th.Tensor, addends: th.Tensor) -> th.Tensor:
     """Multiply each state's actions, (b, N, A), by weights, (A, H), and add the state's part, (b, 1, H): (b N, H)."""
-    return th.baddbmm(addends, actions, weight.expand(len(actions), -1, -1)).flatten(0, 1)
+    return th.baddbmm(addends, actions, weight.expand(actions.shape[0], -1, -1)).flatten(0, 1)
 
 
-def _clamp_each(hidden: th.Tensor, floors: th.Tensor) -> th.Tensor:
+def _raise_each(hidden: th.Tensor, floors: th.Tensor) -> th.Tensor:
     """Raise the activations of each state's actions, (b N, H), to the state's floors, (b, 1, H), in place."""
-    by_state = hidden.unflatten(0, (len(floors), -1))
+    by_state = hidden.unflatten(0, (floors.shape[0], -1))
     th.maximum(by_state, floors, out=by_state)
+    return hidden
+
+
+def _lower_each(hidden: th.Tensor, ceilings: th.Tensor) -> th.Tensor:
+    """
+    Lower activations of 16 bits, (b, N, H), to ceilings that are not negative, (b, 1, H), in place.
+
+    As integers, which are compared five times as fast. Their order is that of the numbers wherever one of the two is not
+    negative; only the order among negative numbers is the reverse. Zero's sign bit must not be set.
+    """
+    integers = hidden.view(th.int16)
+    th.minimum(integers, ceilings.abs().view(th.int16), out=integers)
     return hidden
 
 
@@ -239,8 +258,8 @@ def _is_rectifier_network(q_network: nn.Sequential) -> bool:
 def _begins_with_linear(q_network: nn.Module) -> TypeGuard[nn.Sequential]:
     if type(q_network) is not nn.Sequential or len(q_network) == 0 or not _is_linear(q_network[0]):
         return False
-    # A hook may do anything
-    return not any(map(_is_hooked, q_network.modules()))
+    # A hook may do anything; those of modules within these still run
+    return not any(map(_is_hooked, (q_network, *q_network)))
 
 
 def _is_linear(module: nn.Module) -> TypeGuard[nn.Linear]:

@@ -23,7 +23,8 @@ def test_agrees_with_algorithm_1_given_the_same_draws(iterations, samples, elite
         return (3 * actions * weights.unsqueeze(1)).sin().sum(dim=2)
 
     th.manual_seed(0)
-    actions, spread = CEM(iterations, samples, elites).select(score, n_states, action_dim)
+    selection = CEM(iterations, samples, elites).select(score, n_states, action_dim)
+    actions, spread = selection.actions, selection.spread
     th.manual_seed(0)
     mean_actions = CEM(iterations, samples, elites, result="mean").select(score, n_states, action_dim).actions
     th.manual_seed(0)
@@ -91,9 +92,9 @@ def test_the_winner_was_scored_and_is_the_best_of_the_last_iteration():
 
 def test_one_elite_collapses_the_distribution():
     th.manual_seed(0)
-    actions, spread = CEM(2, 50, 1).select(quadratic(th.full((3, 1), 0.2)), 3, 1)
-    assert th.equal(spread, th.zeros(3, 1))
-    assert th.all((actions - 0.2).abs() < 0.2)
+    selection = CEM(2, 50, 1).select(quadratic(th.full((3, 1), 0.2)), 3, 1)
+    assert th.equal(selection.spread, th.zeros(3, 1))
+    assert th.all((selection.actions - 0.2).abs() < 0.2)
 
 
 def test_nan_is_never_an_elite():
@@ -104,9 +105,10 @@ def test_nan_is_never_an_elite():
         # Everything above zero is poisoned: a NaN that sorted highest would win
         return values.masked_fill(actions[:, :, 0] > 0, th.nan)
 
-    actions, spread = CEM(5, 64, 6).select(score, 8, 1)
+    selection = CEM(5, 64, 6).select(score, 8, 1)
+    actions = selection.actions
     assert th.all(actions < 0)
-    assert th.all(spread.isfinite())
+    assert th.all(selection.spread.isfinite())
     assert actions.flatten().tolist() == pytest.approx([-0.5] * 8, abs=0.05)
 
 

@@ -79,8 +79,9 @@ def test_scoring_changes_neither_its_inputs_nor_the_network():
 
 def rounded_differences(network, features, actions):
     """
-    The network a state at a time in float64, save for the hidden layers' products. They are of what an action's activations
-    differ by from those of the state's mean action: weights, differences and products are rounded to bfloat16.
+    The network a state at a time in float64, save for what an action's activations differ by from those of the state's mean
+    action. To bfloat16 are rounded: that difference, wherever a layer takes or gives it, the weights that it is multiplied
+    by, and how far from zero the mean action's activations are in the first layer.
     """
 
     def rounded(tensor):
@@ -90,23 +91,33 @@ def rounded_differences(network, features, actions):
         return oracles.perceptron([layer.weight], [layer.bias], inputs)
 
     first, *hidden_layers, last = [layer for layer in network if isinstance(layer, nn.Linear)]
+    action_weight = rounded(first.weight[:, N_FEATURES:])
     scores = th.empty(actions.shape[:2])
     for state, of_state in enumerate(actions):
-        common, *rows = (apply(first, th.cat([features[state], action])) for action in (of_state.mean(dim=0), *of_state))
+        mean_action = of_state.mean(dim=0)
+        common = apply(first, th.cat([features[state], mean_action]))
+        from_zero = rounded(common)
+        differences = [
+            (rounded(action_weight @ rounded(action - mean_action) + from_zero.clamp(max=0.0))).maximum(
+                -from_zero.clamp(min=0.0)
+            )
+            for action in of_state
+        ]
         for layer in hidden_layers:
-            before, common = common.clamp(min=0.0), apply(layer, common.clamp(min=0.0))
-            differences = [rounded(row.clamp(min=0.0) - before) for row in rows]
+            common = apply(layer, common.clamp(min=0.0))
             rows = [common + rounded(rounded(layer.weight) @ difference) for difference in differences]
+            differences = [rounded(row.clamp(min=0.0) - common.clamp(min=0.0)) for row in rows]
         scores[state] = th.cat([apply(last, row.clamp(min=0.0)) for row in rows])
     return scores
 
 
 @pytest.mark.parametrize("with_onednn", [True, False])
+@pytest.mark.parametrize("net_arch", [[32, 16], [32, 64, 16], [64, 64, 64, 64]])
 @th.no_grad()
-def test_bfloat16_rounds_differences_between_actions_and_nothing_else(monkeypatch, with_onednn):
+def test_bfloat16_rounds_differences_between_actions_and_nothing_else(monkeypatch, with_onednn, net_arch):
     if not with_onednn:
         monkeypatch.setattr(scoring, "_onednn_linear", lambda dtype: None)
-    network = mlp([32, 64, 16])
+    network = mlp(net_arch)
     features = th.randn(scoring.MANY_STATES, N_FEATURES)
     actions = th.rand(scoring.MANY_STATES, 6, ACTION_DIM) * 2 - 1
     # Few states are scored in float32
@@ -228,3 +239,12 @@ def test_calls_take_no_fresh_memory_from_the_system():
     counts = subprocess.run([sys.executable, "-c", COUNT_FRESH_PAGES], check=True, capture_output=True, text=True).stdout
     assert all(float(count) < 128 for count in counts.split())
     assert len(counts.split()) == 2
+
+
+@th.no_grad()
+def test_comparing_as_integers_is_comparing_numbers():
+    values = th.tensor([0.0, -0.0, 1e-30, -1e-30, 0.5, -0.5, 3.0, -3.0, 1e30, -1e30, th.inf, -th.inf])
+    ceilings = th.tensor([0.0, -0.0, 1e-30, 0.5, 3.0, th.inf])
+    for ceiling in ceilings.bfloat16():
+        lowered = scoring._lower_each(values.bfloat16().view(1, -1, 1), ceiling.view(1, 1, 1))
+        assert lowered.flatten().tolist() == [min(value, ceiling.item()) for value in values.bfloat16().tolist()]
