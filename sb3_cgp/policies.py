@@ -10,10 +10,11 @@ from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.td3.policies import TD3Policy
+from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 
 from sb3_cgp.cem import CEM, ActionSelector, Selection
+from sb3_cgp.perceptron import Perceptron
 from sb3_cgp.scoring import q_score, scoring_dtype
 from sb3_cgp.validation import INFERENCES, SCORING_DTYPES, require_choice
 
@@ -87,6 +88,31 @@ class CGPPolicy(TD3Policy):
         self.inference = inference
         self.cem_dtype = cem_dtype
         self._select: Callable[..., Any] | None = None
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        """
+        Make TD3's actor, as a :class:`~sb3_cgp.perceptron.Perceptron`.
+
+        :param features_extractor: the features extractor; None for one of its own
+        :return: the actor
+        """
+        actor = super().make_actor(features_extractor)
+        actor.mu = Perceptron(*actor.mu)
+        return actor
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
+        """
+        Make TD3's critic, of :class:`~sb3_cgp.perceptron.Perceptron` s.
+
+        :param features_extractor: the features extractor; None for one of its own
+        :return: the critic
+        """
+        critic = super().make_critic(features_extractor)
+        for index, q_network in enumerate(critic.q_networks):
+            assert isinstance(q_network, nn.Sequential)
+            critic.q_networks[index] = Perceptron(*q_network)
+            critic.add_module(f"qf{index}", critic.q_networks[index])
+        return critic
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()

@@ -13,6 +13,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_cgp.cem import Score
+from sb3_cgp.perceptron import Perceptron
+from sb3_cgp.products import is_hooked, is_linear, multiply
 
 # Hidden activations of one block: about what stays in the caches near one or two cores (2 MiB of float32)
 BLOCK_SIZE = 2**19
@@ -25,25 +27,6 @@ MANY_STATES = 8
 
 # Maps hidden activations, (B N, H), to the next ones, and may overwrite them
 Layer = Callable[[th.Tensor], th.Tensor]
-
-
-@functools.cache
-def _onednn_linear(dtype: th.dtype) -> Callable[..., th.Tensor] | None:
-    """
-    Find oneDNN's linear layer with a rectifier fused to it, which PyTorch's compiler uses and keeps private.
-
-    The public one asks MKL for float32, which is at half oneDNN's speed on AMD's processors, and does not fuse.
-
-    :param dtype: the data type
-    :return: the function; None where there is none, or none for this processor
-    """
-    linear = getattr(th.ops.mkldnn, "_linear_pointwise", None) if th.backends.mkldnn.is_available() else None
-    if linear is not None:
-        try:
-            linear(th.ones(1, 1, dtype=dtype), th.ones(1, 1, dtype=dtype), None, "relu", [], "")
-        except RuntimeError:
-            return None
-    return linear
 
 
 @functools.cache
@@ -142,7 +125,7 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
     and d by how much it differs for one of them. What follows from u is computed once per state, in float32. Only
     differences are rounded, which CEM ranks, and not what a state's actions have in common, which may be much larger.
     """
-    first, *hidden, last = [module for module in q_network if _is_linear(module)]
+    first, *hidden, last = [module for module in q_network if is_linear(module)]
     state_part, action_weight = _split(first, features)
     # The first of them is given differences with their signs turned
     weights = [-hidden[0].weight.to(dtype), *(layer.weight.to(dtype) for layer in hidden[1:])]
@@ -152,7 +135,7 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
         common_actions = actions.mean(dim=1, keepdim=True)
         common = [th.addmm(state_part.squeeze(1), common_actions.squeeze(1), action_weight)]  # (B, H) each
         for layer in hidden:
-            common.append(_multiply(common[-1].relu(), layer.weight, layer.bias))
+            common.append(multiply(common[-1].relu(), layer.weight, layer.bias))
         # The last hidden layer in fewer passes: relu(u + d) = u + max(d, -u)
         common_values = F.linear(common[-1], last.weight, last.bias)
         # The first one, with its sign turned: min(-d - min(u, 0), relu(u)), whose first part is one product
@@ -169,10 +152,10 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
         ) -> th.Tensor:
             block_offsets, block_floors = of_states[: len(offsets)], of_states[len(offsets) :]
             rounded = _lower_each(th.bmm(block_actions, first_weight), block_ceilings).flatten(0, 1)
-            different = _multiply(rounded, weights[0]).to(actions.dtype)
+            different = multiply(rounded, weights[0]).to(actions.dtype)
             for weight, block_offset, block_floor in zip(weights[1:], block_offsets, block_floors, strict=False):
                 different.unflatten(0, block_actions.shape[:2]).add_(block_offset)
-                different = _multiply(_raise_each(different, block_floor).to(dtype), weight).to(actions.dtype)
+                different = multiply(_raise_each(different, block_floor).to(dtype), weight).to(actions.dtype)
             return F.linear(_raise_each(different, block_floors[-1]), last.weight)
 
         values = _in_blocks(score_block, width, different_actions, first_weights, ceilings, *offsets, *floors)
@@ -234,60 +217,30 @@ def _lower_each(hidden: th.Tensor, ceilings: th.Tensor) -> th.Tensor:
 
 def _prepare(modules: list[nn.Module]) -> list[Layer]:
     """Turn the modules after the first into layers."""
-    last = max((index for index, module in enumerate(modules) if _is_linear(module)), default=None)
     layers: list[Layer] = []
     is_fused = False
     for index, module in enumerate(modules):
-        if _is_linear(module):
-            is_fused = index != last and type(modules[index + 1]) is nn.ReLU
-            layers.append(_last_linear(module) if index == last else _hidden_linear(module, is_fused))
+        if is_linear(module):
+            is_fused = type(modules[min(index + 1, len(modules) - 1)]) is nn.ReLU
+            layers.append(functools.partial(multiply, weight=module.weight, bias=module.bias, is_rectified=is_fused))
         elif is_fused:
             is_fused = False
         else:
-            layers.append(_activation(module))
+            layers.append(th.relu_ if type(module) is nn.ReLU else module)
     return layers
 
 
 def _is_rectifier_network(q_network: nn.Sequential) -> bool:
     """Whether a network has linear layers alone, at least three, and rectifiers between them."""
     linear, rectifiers = list(q_network)[::2], list(q_network)[1::2]
-    alternates = all(map(_is_linear, linear)) and all(type(module) is nn.ReLU for module in rectifiers)
+    alternates = all(map(is_linear, linear)) and all(type(module) is nn.ReLU for module in rectifiers)
     return alternates and len(linear) == len(rectifiers) + 1 > 2
 
 
 def _begins_with_linear(q_network: nn.Module) -> TypeGuard[nn.Sequential]:
-    if type(q_network) is not nn.Sequential or len(q_network) == 0 or not _is_linear(q_network[0]):
+    if not isinstance(q_network, nn.Sequential) or type(q_network) not in (nn.Sequential, Perceptron):
+        return False
+    if len(q_network) == 0 or not is_linear(q_network[0]):
         return False
     # A hook may do anything; those of modules within these still run
-    return not any(map(_is_hooked, (q_network, *q_network)))
-
-
-def _is_linear(module: nn.Module) -> TypeGuard[nn.Linear]:
-    # A subclass may do anything
-    return type(module) is nn.Linear
-
-
-def _is_hooked(module: nn.Module) -> bool:
-    # PyTorch has no public way to ask
-    return bool(module._forward_hooks or module._forward_pre_hooks)
-
-
-def _activation(module: nn.Module) -> Layer:
-    return th.relu_ if type(module) is nn.ReLU else module
-
-
-def _hidden_linear(linear: nn.Linear, is_rectified: bool) -> Layer:
-    """Make a hidden linear layer and its rectifier."""
-    return lambda hidden: _multiply(hidden, linear.weight, linear.bias, is_rectified)
-
-
-def _multiply(hidden: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None, is_rectified: bool = False) -> th.Tensor:
-    onednn_linear = _onednn_linear(hidden.dtype) if hidden.device.type == "cpu" else None
-    if onednn_linear is not None:
-        return onednn_linear(hidden, weight, bias, "relu" if is_rectified else "none", [], "")
-    product = F.linear(hidden, weight, bias)
-    return product.relu_() if is_rectified else product
-
-
-def _last_linear(linear: nn.Linear) -> Layer:
-    return lambda hidden: F.linear(hidden, linear.weight, linear.bias)
+    return not any(map(is_hooked, (q_network, *q_network)))

@@ -11,7 +11,7 @@ import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
-from sb3_cgp import scoring
+from sb3_cgp import products, scoring
 from sb3_cgp.scoring import q_score, repeated_q_score
 
 N_FEATURES, ACTION_DIM = 7, 3
@@ -116,7 +116,7 @@ def rounded_differences(network, features, actions):
 @th.no_grad()
 def test_bfloat16_rounds_differences_between_actions_and_nothing_else(monkeypatch, with_onednn, net_arch):
     if not with_onednn:
-        monkeypatch.setattr(scoring, "_onednn_linear", lambda dtype: None)
+        monkeypatch.setattr(products, "onednn_linear", lambda dtype: None)
     network = mlp(net_arch)
     features = th.randn(scoring.MANY_STATES, N_FEATURES)
     actions = th.rand(scoring.MANY_STATES, 6, ACTION_DIM) * 2 - 1
@@ -199,19 +199,19 @@ def test_without_onednn_scores_are_the_same(monkeypatch, reason):
     else:
         functions = SimpleNamespace() if reason == "no such function" else SimpleNamespace(_linear_pointwise=refuse)
         monkeypatch.setattr(th.ops, "mkldnn", functions)
-    scoring._onednn_linear.cache_clear()
+    products.onednn_linear.cache_clear()
     try:
-        assert scoring._onednn_linear(th.float32) is None
+        assert products.onednn_linear(th.float32) is None
         features, actions = th.randn(4, N_FEATURES), th.rand(4, 6, ACTION_DIM)
         for network in (NETWORKS["two hidden layers"], NETWORKS["three layers, tanh"]):
             th.testing.assert_close(q_score(network, features)(actions), repeated_q_score(network, features)(actions))
     finally:
-        scoring._onednn_linear.cache_clear()
+        products.onednn_linear.cache_clear()
 
 
 def test_the_private_function_exists_in_the_tested_pytorch():
     # Without it everything works, but no faster than MKL: the constraints' PyTorch should have it
-    assert scoring._onednn_linear(th.float32) is not None or not th.backends.mkldnn.is_available()
+    assert products.onednn_linear(th.float32) is not None or not th.backends.mkldnn.is_available()
 
 
 COUNT_FRESH_PAGES = """

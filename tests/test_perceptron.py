@@ -1,0 +1,106 @@
+"""Perceptrons against PyTorch's own sequence of the same modules, values and gradients alike."""
+
+import copy
+
+import pytest
+import torch as th
+from stable_baselines3 import TD3
+from stable_baselines3.common.torch_layers import create_mlp
+from torch import nn
+
+from sb3_cgp import CGP, products
+from sb3_cgp.perceptron import MANY_ROWS, Perceptron
+
+N_INPUTS = 11
+
+
+def modules(net_arch, activation_fn=nn.ReLU, **kwargs):
+    th.manual_seed(0)
+    return create_mlp(N_INPUTS, 2, net_arch, activation_fn, **kwargs)
+
+
+NETWORKS = {
+    # Large enough for oneDNN, and not
+    "wide": modules([256, 192]),
+    "narrow": modules([8, 16, 4]),
+    "actor": modules([256, 256], squash_output=True),
+    "no hidden layer": modules([]),
+    "without bias": modules([160, 128], with_bias=False),
+    "another activation": modules([16, 16], nn.Tanh),
+    "batch norm": [nn.Linear(N_INPUTS, 8), nn.BatchNorm1d(8), nn.ReLU(), nn.Linear(8, 2)],
+    "two rectifiers": [nn.Linear(N_INPUTS, 8), nn.ReLU(), nn.ReLU(), nn.Linear(8, 2)],
+    "ends with a rectifier": [nn.Linear(N_INPUTS, 8), nn.ReLU()],
+    "empty": [],
+}
+
+
+def outcome(network, inputs):
+    """What a network gives, and the gradients by its inputs and parameters."""
+    inputs = inputs.clone().requires_grad_()
+    outputs = network(inputs)
+    (outputs.sin() * th.arange(1.0, outputs.shape[1] + 1)).sum().backward()
+    return [outputs, inputs.grad, *(parameter.grad for parameter in network.parameters())]
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("rows", [1, MANY_ROWS, 200])
+@pytest.mark.parametrize("with_onednn", [True, False])
+def test_values_and_gradients_are_those_of_the_sequence(monkeypatch, name, rows, with_onednn):
+    if not with_onednn:
+        monkeypatch.setattr(products, "onednn_linear", lambda dtype: None)
+    network = Perceptron(*copy.deepcopy(NETWORKS[name]))
+    # Batch norm takes no batch of one for training
+    network.train(rows > 1)
+    # In float64, by PyTorch alone
+    twin = nn.Sequential(*copy.deepcopy(list(network))).double()
+    inputs = th.randn(rows, N_INPUTS)
+    for ours, theirs in zip(outcome(network, inputs), outcome(twin, inputs.double()), strict=True):
+        assert ours.dtype == th.float32
+        th.testing.assert_close(ours.double(), theirs, rtol=1e-4, atol=1e-4)
+
+
+def test_only_the_gradients_that_are_needed_are_given():
+    network = Perceptron(*copy.deepcopy(NETWORKS["wide"])).requires_grad_(False)
+    network[2].weight.requires_grad_()
+    inputs = th.randn(MANY_ROWS, N_INPUTS)
+    network(inputs).sum().backward()
+    assert [parameter.grad is not None for parameter in network.parameters()] == [False, False, True, False, False, False]
+    assert inputs.grad is None
+    with th.no_grad():
+        assert not network(inputs).requires_grad
+
+
+@pytest.mark.parametrize("kind", ["forward", "pre-forward", "backward", "pre-backward"])
+def test_hooks_are_called(kind):
+    called = []
+    network = Perceptron(*copy.deepcopy(NETWORKS["wide"]))
+    register = {
+        "forward": network[2].register_forward_hook,
+        "pre-forward": network[2].register_forward_pre_hook,
+        "backward": network[2].register_full_backward_hook,
+        "pre-backward": network[2].register_full_backward_pre_hook,
+    }[kind]
+    register(lambda *args: called.append(kind))
+    network(th.randn(MANY_ROWS, N_INPUTS)).sum().backward()
+    assert called == [kind]
+
+
+def test_a_second_derivative_is_refused_rather_than_wrong():
+    network = Perceptron(*copy.deepcopy(NETWORKS["wide"]))
+    inputs = th.randn(MANY_ROWS, N_INPUTS, requires_grad=True)
+    (gradient,) = th.autograd.grad(network(inputs).square().sum(), inputs, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
+
+
+def test_parameters_have_the_names_that_td3_gives_them():
+    arguments = dict(env="Pendulum-v1", policy_kwargs=dict(net_arch=[16, 16]), seed=0, buffer_size=10)
+    model, td3 = CGP("MlpPolicy", **arguments), TD3("MlpPolicy", **arguments)
+    assert [name for name, _ in model.policy.named_parameters()] == [name for name, _ in td3.policy.named_parameters()]
+    networks = [model.actor.mu, model.actor_target.mu, *model.critic.q_networks, *model.critic_target.q_networks]
+    assert all(type(network) is Perceptron for network in networks)
+    # The critics' list and their modules are the same
+    model.policy.load_state_dict(td3.policy.state_dict())
+    observations, actions = th.randn(40, 3), th.rand(40, 1)
+    for ours, theirs in zip(model.critic(observations, actions), td3.critic(observations, actions), strict=True):
+        th.testing.assert_close(ours, theirs)
