@@ -27,6 +27,7 @@ from sb3_cgp.files import write_atomically
 FOLDER = Path("benchmark/results/sweeps")
 RUNTIME = Path(__file__).parent / "results/runtime/runtime.json"
 PAGE = "results.md"
+FIGURES = "figures"
 FIGURES_ONLY = "--figures-only"
 STABILITY = "Stability: the share of runs, {}, that reach at least a final reward, with pointwise 95 % bands."
 
@@ -120,7 +121,7 @@ def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
     def picture(kind: str, caption: str, content: bytes) -> Picture:
         # Some tasks have a slash in their name
         folder, name = (re.sub(r"[^\w.-]+", "_", text) for text in (study.name, kind))
-        return Picture(f"figures/{folder}/{name}.png", caption, content)
+        return Picture(f"{FIGURES}/{folder}/{name}.png", caption, content)
 
     if not study.axes:
         curve = (
@@ -168,7 +169,7 @@ def stability_together(studies: Sequence[Study], repetitions: int = REPETITIONS)
         return []
     methods = list(dict.fromkeys(method for study in largest for method in study.methods))
     caption = STABILITY.format(f"of all sweeps ({', '.join(study.name for study in largest)}) that name the method")
-    return [Picture("figures/stability.png", caption, stability(score_table(largest), methods, repetitions))]
+    return [Picture(f"{FIGURES}/stability.png", caption, stability(score_table(largest), methods, repetitions))]
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -178,7 +179,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     :param argv: the command line; None for the process's own
     """
     parser = argparse.ArgumentParser(prog="python -m benchmark.figures", description="Draw and report on sweeps.")
-    parser.add_argument("studies", nargs="+", metavar="STUDY", help="a study's folder, or its name in the storage")
+    parser.add_argument(
+        "studies", nargs="*", metavar="STUDY", help="a study's folder, or its name in the storage (default: all in --folder)"
+    )
     parser.add_argument("--folder", type=output_folder, default=FOLDER, help="where the results go (default: %(default)s)")
     parser.add_argument("--storage", help="where named studies are: a database's URL")
     parser.add_argument(
@@ -186,8 +189,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     parser.add_argument(FIGURES_ONLY, action="store_true", help="draw the figures, and leave the page as it is")
     args = parser.parse_args(argv)
+    # Where the shell names all folders, it names that of the figures, too
+    named = [study for study in args.studies if Path(study) != args.folder / FIGURES]
     try:
-        folders = [find(study, args.storage, args.folder) for study in args.studies]
+        folders = [find(study, args.storage, args.folder) for study in named] or study_folders(args.folder)
+        if not folders:
+            raise FileNotFoundError(f"{args.folder} holds no study")
         print(figures(folders, args.folder, args.repetitions, not args.figures_only))
     except (FileNotFoundError, ValueError) as error:
         sys.exit(f"Error: {error}")

@@ -1,6 +1,7 @@
 """``python -m benchmark.figures``: which figures studies get, what the page says, and that both repeat."""
 
 import shlex
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -156,6 +157,23 @@ def test_mistakes_are_named(folder: Path, tmp_path: Path, capsys: pytest.Capture
     with pytest.raises(SystemExit):
         main([str(folder / "axis"), "--repetitions", "0", "--folder", str(tmp_path)])
     assert "'0' is not an integer >= 1" in capsys.readouterr().err
+
+
+def test_all_studies_of_a_folder(folder: Path, tmp_path: Path) -> None:
+    for study in ("axis", "axes"):
+        shutil.copytree(folder / study, tmp_path / study)
+    options = ["--folder", str(tmp_path), "--repetitions", "20"]
+    main(options)
+    page = (tmp_path / "results.md").read_text()
+    assert "## The study axis" in page
+    assert "## The study axes" in page
+    # As the shell has them in the place of a star, the folder of the figures among them
+    folders = [f"{path}/" for path in sorted(tmp_path.iterdir()) if path.is_dir()]
+    assert str(tmp_path / "figures/") in [path.rstrip("/") for path in folders]
+    main([*folders, *options])
+    assert (tmp_path / "results.md").read_text() == page
+    with pytest.raises(SystemExit, match="holds no study"):
+        main(["--folder", str(tmp_path / "axis")])
 
 
 def test_named_study_is_taken_from_its_storage(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
