@@ -14,6 +14,9 @@ from sb3_cgp.validation import check_cem
 # Scores N actions for each of B states: (B, N, A) in [-1, 1] -> (B, N), higher is better
 Score = Callable[[th.Tensor], th.Tensor]
 
+# From which on a function that is faster makes up for its further operations
+MANY_VALUES = 2**12
+
 
 class Selection(NamedTuple):
     """
@@ -90,13 +93,20 @@ class CEM:
             samples = th.addcmul(mean, std, th.randn(n_states, self.samples, action_dim, device=device))
             elites = self._select_elites(score, samples)
         result = elites[:, 0] if self.result == "best" else elites.mean(dim=1)
-        return Selection(actions=th.tanh(result), elites=elites)
+        return Selection(actions=_squash(result), elites=elites)
 
     def _select_elites(self, score: Score, samples: th.Tensor) -> th.Tensor:
         """Select the elites of samples before tanh, (B, N, A): (B, K, A), best first."""
-        values = score(th.tanh(samples)).nan_to_num(nan=-th.inf, posinf=th.inf, neginf=-th.inf)  # (B, N)
+        values = score(_squash(samples)).nan_to_num(nan=-th.inf, posinf=th.inf, neginf=-th.inf)  # (B, N)
         winners = values.topk(self.elites, dim=1).indices  # (B, K)
         return samples.gather(1, winners.unsqueeze(2).expand(-1, -1, samples.shape[2]))
+
+
+def _squash(values: th.Tensor) -> th.Tensor:
+    """Compute tanh; of many values by the logistic function, which takes PyTorch a fifth of the time on a CPU."""
+    if values.numel() < MANY_VALUES:
+        return values.tanh()
+    return (2.0 * values).sigmoid_().mul_(2.0).sub_(1.0)
 
 
 def _fit(elites: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

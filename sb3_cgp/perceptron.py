@@ -90,7 +90,7 @@ class _Layers(th.autograd.Function):
             if ctx.needs_input_grad[2 + 2 * layer]:
                 gradients[2 + 2 * layer] = gradient.sum(dim=0)
             if layer > 0:
-                gradient = multiply(gradient, weights[layer].t()).mul_(hidden[layer] > 0)
+                gradient = th.ops.aten.threshold_backward(multiply(gradient, weights[layer].t()), hidden[layer], 0)
             elif ctx.needs_input_grad[0]:
                 gradients[0] = multiply(gradient, weights[0].t())
         return tuple(gradients)

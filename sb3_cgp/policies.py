@@ -87,6 +87,7 @@ class CGPPolicy(TD3Policy):
         self.selector = CEM() if selector is None else selector
         self.inference = inference
         self.cem_dtype = cem_dtype
+        self._action_dim = get_action_dim(action_space)
         self._select: Callable[..., Any] | None = None
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
@@ -131,11 +132,16 @@ class CGPPolicy(TD3Policy):
         :param critic: the critic, or the target critic
         :return: the selected actions, (B, A), in the scaled action space, and the selector's last elites
         """
-        with _evaluation_mode(critic):
+        was_training = critic.training
+        if was_training:
+            critic.eval()
+        try:
             features = critic.extract_features(observation, critic.features_extractor)
-            dtype = scoring_dtype(self.cem_dtype, features.device)
-            score = q_score(critic.q_networks[0], features, dtype)
-            return self.selector.select(score, len(features), get_action_dim(self.action_space), features.device)
+            score = q_score(critic.q_networks[0], features, scoring_dtype(self.cem_dtype, features.device))
+            return self.selector.select(score, features.shape[0], self._action_dim, features.device)
+        finally:
+            if was_training:
+                critic.train()
 
     def set_training_mode(self, mode: bool) -> None:
         """
@@ -172,19 +178,6 @@ class CGPPolicy(TD3Policy):
                 return self.select_actions(observation, self.critic).actions
         actor = self.actor_target if self.inference == "averaged_actor" else self.actor
         return actor(observation)
-
-
-@contextmanager
-def _evaluation_mode(network: nn.Module) -> Iterator[None]:
-    """Put a network in evaluation mode for a while."""
-    was_training = network.training
-    if was_training:
-        network.eval()
-    try:
-        yield
-    finally:
-        if was_training:
-            network.train()
 
 
 MlpPolicy = CGPPolicy

@@ -11,6 +11,9 @@ from torch.nn import functional as F
 # Multiplications from which on oneDNN makes up for what a call of it costs
 MANY_MULTIPLICATIONS = 2**21
 
+# Rows are few if there are this many times as many outputs
+FEW_ROWS = 4
+
 
 @functools.cache
 def onednn_linear(dtype: th.dtype) -> Callable[..., th.Tensor] | None:
@@ -43,9 +46,14 @@ def multiply(inputs: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None
     """
     is_large = inputs.device.type == "cpu" and inputs.shape[0] * weight.numel() >= MANY_MULTIPLICATIONS
     linear = onednn_linear(inputs.dtype) if is_large else None
-    if linear is not None:
+    if linear is None:
+        product = F.linear(inputs, weight, bias)
+    elif inputs.shape[0] * FEW_ROWS > weight.shape[0]:
         return linear(inputs, weight, bias, "relu" if is_rectified else "none", [], "")
-    product = F.linear(inputs, weight, bias)
+    else:
+        # It brings its second operand into an order of its own, at the price of a copy: that is to be the smaller one
+        product = linear(weight, inputs, None, "none", [], "").t()
+        product = product if bias is None else product.add_(bias)
     return product.relu_() if is_rectified else product
 
 

@@ -129,29 +129,31 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
     state_part, action_weight = _split(first, features)
     # The first of them is given differences with their signs turned
     weights = [-hidden[0].weight.to(dtype), *(layer.weight.to(dtype) for layer in hidden[1:])]
+    first_weight = action_weight.to(dtype).expand(features.shape[0], -1, -1)
     width = max(layer.out_features for layer in (first, *hidden))
 
     def score(actions: th.Tensor) -> th.Tensor:
         common_actions = actions.mean(dim=1, keepdim=True)
         common = [th.addmm(state_part.squeeze(1), common_actions.squeeze(1), action_weight)]  # (B, H) each
+        rectified = []
         for layer in hidden:
-            common.append(multiply(common[-1].relu(), layer.weight, layer.bias))
+            rectified.append(common[-1].relu())
+            common.append(multiply(rectified[-1], layer.weight, layer.bias))
         # The last hidden layer in fewer passes: relu(u + d) = u + max(d, -u)
         common_values = F.linear(common[-1], last.weight, last.bias)
-        # The first one, with its sign turned: min(-d - min(u, 0), relu(u)), whose first part is one product
-        different_actions = F.pad(common_actions - actions, (0, 1), value=1.0).to(dtype)  # (B, N, A + 1)
-        first_weights = th.cat([action_weight.expand(len(actions), -1, -1), -common[0].clamp(max=0.0).unsqueeze(1)], dim=1).to(
-            dtype
-        )  # (B, A + 1, H)
-        ceilings = common[0].relu().to(dtype).unsqueeze(1)
+        # The first one with its sign turned, min(-d - min(u, 0), relu(u)), whose first part is one product
+        different_actions = F.pad((common_actions - actions).to(dtype), (0, 1), value=1.0)  # (B, N, A + 1)
+        first_offsets = (rectified[0] - common[0]).to(dtype).unsqueeze(1)
+        first_weights = th.cat([first_weight, first_offsets], dim=1)  # (B, A + 1, H)
+        ceilings = rectified[0].abs().to(dtype).unsqueeze(1)
         offsets = [values.clamp(max=0.0).unsqueeze(1) for values in common[1:-1]]
-        floors = [values.relu().neg_().unsqueeze(1) for values in common[1:-1]] + [common[-1].neg().unsqueeze(1)]
+        floors = [values.neg().unsqueeze(1) for values in (*rectified[1:], common[-1])]
 
         def score_block(
-            block_actions: th.Tensor, first_weight: th.Tensor, block_ceilings: th.Tensor, *of_states: th.Tensor
+            block_actions: th.Tensor, block_weights: th.Tensor, block_ceilings: th.Tensor, *of_states: th.Tensor
         ) -> th.Tensor:
             block_offsets, block_floors = of_states[: len(offsets)], of_states[len(offsets) :]
-            rounded = _lower_each(th.bmm(block_actions, first_weight), block_ceilings).flatten(0, 1)
+            rounded = _lower_each(th.bmm(block_actions, block_weights), block_ceilings).flatten(0, 1)
             different = multiply(rounded, weights[0]).to(actions.dtype)
             for weight, block_offset, block_floor in zip(weights[1:], block_offsets, block_floors, strict=False):
                 different.unflatten(0, block_actions.shape[:2]).add_(block_offset)
@@ -193,6 +195,8 @@ def _in_blocks(score_block: Callable[..., th.Tensor], width: int, actions: th.Te
 
 def _multiply_each(actions: th.Tensor, weight: th.Tensor, addends: th.Tensor) -> th.Tensor:
     """Multiply each state's actions, (b, N, A), by weights, (A, H), and add the state's part, (b, 1, H): (b N, H)."""
+    if actions.shape[0] == 1:
+        return th.addmm(addends[0], actions[0], weight)
     return th.baddbmm(addends, actions, weight.expand(actions.shape[0], -1, -1)).flatten(0, 1)
 
 
@@ -208,10 +212,10 @@ def _lower_each(hidden: th.Tensor, ceilings: th.Tensor) -> th.Tensor:
     Lower activations of 16 bits, (b, N, H), to ceilings that are not negative, (b, 1, H), in place.
 
     As integers, which are compared five times as fast. Their order is that of the numbers wherever one of the two is not
-    negative; only the order among negative numbers is the reverse. Zero's sign bit must not be set.
+    negative; only the order among negative numbers is the reverse. So no ceiling may have its sign bit set, not even zero.
     """
     integers = hidden.view(th.int16)
-    th.minimum(integers, ceilings.abs().view(th.int16), out=integers)
+    th.minimum(integers, ceilings.view(th.int16), out=integers)
     return hidden
 
 

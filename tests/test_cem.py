@@ -4,7 +4,7 @@ import oracles
 import pytest
 import torch as th
 
-from sb3_cgp import CEM
+from sb3_cgp import CEM, cem
 
 
 def quadratic(peak: th.Tensor):
@@ -123,3 +123,11 @@ def test_refuses_impossible_counts(name, value):
 def test_refuses_an_unknown_result():
     with pytest.raises(ValueError, match="`result` is 'worst', but must be one of 'best', 'mean'"):
         CEM(result="worst")
+
+
+def test_squashing_is_tanh():
+    values = th.cat([th.linspace(-20.0, 20.0, 100_001), th.tensor([1e-30, -1e-30, 1e30, -1e30, th.inf, -th.inf, th.nan])])
+    squashed = cem._squash(values)
+    th.testing.assert_close(squashed, values.tanh(), rtol=0.0, atol=2e-7, equal_nan=True)
+    assert squashed[:-1].abs().max() == 1.0
+    assert th.equal(cem._squash(values[:9]), values[:9].tanh())
