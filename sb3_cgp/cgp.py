@@ -91,9 +91,9 @@ class CGP(ResumableAlgorithm, GradientAlgorithm):
     :param cem_samples: actions that CEM samples per state and iteration
     :param cem_elites: best samples that CEM's next iteration is fitted to, at most ``cem_samples``
     :param cem_result: "best" acts by the best sample of the last iteration (the paper), "mean" by the elites' mean
-    :param cem_dtype: what the critic's hidden layers compute in while CEM asks it: "float32", "bfloat16", or "auto", which
-        is bfloat16 on processors that multiply it natively. Values, actions and the critic's own training are
-        float32 in any case.
+    :param cem_dtype: what all layers of the critic but the last compute in while CEM asks it: "float32", "bfloat16", or
+        "auto", which is bfloat16 on processors that multiply it natively. Values, actions and the critic's own training
+        are float32 in any case.
     :param cuda_graphs: on a GPU, whether gradient steps and CEM's acting are recorded as CUDA graphs, and the replay buffer
         lies on the GPU, which is to compute the same in less time. What a selector of your own decides in Python is
         decided once, then. Has no effect on a CPU, nor with ``Dict`` observations or another optimiser than the

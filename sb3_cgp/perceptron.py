@@ -8,7 +8,7 @@ from torch.autograd.function import once_differentiable
 
 from sb3_cgp.products import is_hooked, is_linear, multiply
 
-# Rows from which on a batch is for training: fewer are left to PyTorch, for acting and for being traced
+# Rows from which on there is something to gain
 MANY_ROWS = 32
 
 
@@ -16,7 +16,8 @@ class Perceptron(nn.Sequential):
     """
     A sequence of modules that computes itself what linear layers with rectifiers between them do at its beginning.
 
-    It does so for batches of float32 on a CPU, where it can; elsewhere it is PyTorch's sequence.
+    It does so for batches of float32 on a CPU, where it can; elsewhere it is PyTorch's sequence. Such a batch has no second
+    derivatives, nor does ``torch.func`` know its gradient.
     """
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
@@ -26,7 +27,7 @@ class Perceptron(nn.Sequential):
         :param inputs: the batch, (rows, inputs)
         :return: the outputs, (rows, outputs)
         """
-        layers = self._layers() if _is_for_training(inputs) else []
+        layers = self._layers() if _is_for_us(inputs) else []
         if not layers:
             return super().forward(inputs)
         parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
@@ -46,9 +47,12 @@ class Perceptron(nn.Sequential):
         return layers
 
 
-def _is_for_training(inputs: th.Tensor) -> bool:
+def _is_for_us(inputs: th.Tensor) -> bool:
+    # What is traced is to be computed elsewhere
+    if th.jit.is_tracing() or th.compiler.is_compiling() or th.is_autocast_enabled("cpu"):
+        return False
     is_batch = inputs.dim() == 2 and inputs.shape[0] >= MANY_ROWS
-    return is_batch and inputs.device.type == "cpu" and inputs.dtype == th.float32 and not th.compiler.is_compiling()
+    return is_batch and inputs.device.type == "cpu" and inputs.dtype == th.float32
 
 
 class _Layers(th.autograd.Function):
@@ -67,7 +71,7 @@ class _Layers(th.autograd.Function):
         weights, biases = parameters[::2], parameters[1::2]
         hidden = [inputs]
         for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-            hidden.append(multiply(hidden[-1], weight, bias, is_rectified=True))
+            hidden.append(multiply(hidden[-1], weight, bias).relu_())
         ctx.save_for_backward(*hidden, *weights)
         return multiply(hidden[-1], weights[-1], biases[-1])
 

@@ -42,8 +42,8 @@ class CGPPolicy(TD3Policy):
     :param selector: Selects the actions that the critic rates highest, by default CEM with the paper's settings.
         Another sampler only needs the method of :class:`~sb3_cgp.cem.ActionSelector`.
     :param inference: What ``predict`` asks: the "actor", the "averaged_actor" or "cem" (the selector)
-    :param cem_dtype: What the critic's hidden layers compute in while the selector asks it: "float32", "bfloat16", or
-        "auto", which is bfloat16 on processors that multiply it natively
+    :param cem_dtype: What all layers of the critic but the last compute in while the selector asks it: "float32",
+        "bfloat16", or "auto", which is bfloat16 on processors that multiply it natively
     :raises ValueError: if ``inference`` or ``cem_dtype`` is not one of these
     """
 

@@ -18,9 +18,9 @@ FEW_ROWS = 4
 @functools.cache
 def onednn_linear(dtype: th.dtype) -> Callable[..., th.Tensor] | None:
     """
-    Find oneDNN's linear layer with a rectifier fused to it, which PyTorch's compiler uses and keeps private.
+    Find oneDNN's linear layer, which PyTorch's compiler uses and keeps private.
 
-    The public one asks MKL for float32, which is at half oneDNN's speed on AMD's processors, and does not fuse.
+    The public one asks MKL for float32, which is at half oneDNN's speed on AMD's processors.
 
     :param dtype: the data type
     :return: the function; None where there is none, or none for this processor
@@ -28,33 +28,31 @@ def onednn_linear(dtype: th.dtype) -> Callable[..., th.Tensor] | None:
     linear = getattr(th.ops.mkldnn, "_linear_pointwise", None) if th.backends.mkldnn.is_available() else None
     if linear is not None:
         try:
-            linear(th.ones(1, 1, dtype=dtype), th.ones(1, 1, dtype=dtype), None, "relu", [], "")
+            linear(th.ones(1, 1, dtype=dtype), th.ones(1, 1, dtype=dtype), None, "none", [], "")
         except RuntimeError:
             return None
     return linear
 
 
-def multiply(inputs: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None, is_rectified: bool = False) -> th.Tensor:
+def multiply(inputs: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:
     """
     Do what a linear layer does, without gradients.
 
     :param inputs: the rows to multiply, (rows, inputs)
     :param weight: the layer's weight, (outputs, inputs)
     :param bias: the layer's bias, (outputs,)
-    :param is_rectified: whether a rectifier follows
-    :return: the outputs, (rows, outputs)
+    :return: the outputs, (rows, outputs), in memory of their own
     """
     is_large = inputs.device.type == "cpu" and inputs.shape[0] * weight.numel() >= MANY_MULTIPLICATIONS
     linear = onednn_linear(inputs.dtype) if is_large else None
     if linear is None:
-        product = F.linear(inputs, weight, bias)
-    elif inputs.shape[0] * FEW_ROWS > weight.shape[0]:
-        return linear(inputs, weight, bias, "relu" if is_rectified else "none", [], "")
-    else:
-        # It brings its second operand into an order of its own, at the price of a copy: that is to be the smaller one
-        product = linear(weight, inputs, None, "none", [], "").t()
-        product = product if bias is None else product.add_(bias)
-    return product.relu_() if is_rectified else product
+        return F.linear(inputs, weight, bias)
+    # It could rectify, too, but makes NaN zero then
+    if inputs.shape[0] * FEW_ROWS > weight.shape[0]:
+        return linear(inputs, weight, bias, "none", [], "")
+    # It brings its second operand into an order of its own, at the price of a copy: that is to be the smaller one
+    product = linear(weight, inputs, None, "none", [], "").t()
+    return product if bias is None else product.add_(bias)
 
 
 def is_linear(module: nn.Module) -> TypeGuard[nn.Linear]:

@@ -43,7 +43,7 @@ def _keep_freed_memory() -> None:
 
 def scoring_dtype(setting: str, device: th.device) -> th.dtype:
     """
-    Tell which data type hidden layers compute in while actions are scored.
+    Tell which data type all layers but the last compute in while actions are scored.
 
     :param setting: "float32", "bfloat16", or "auto": bfloat16 where the processor multiplies it natively
     :param device: the device of the critic
@@ -62,16 +62,17 @@ def _has_native_bfloat16() -> bool:
 
 def q_score(q_network: nn.Module, features: th.Tensor, dtype: th.dtype = th.float32) -> Score:
     """
-    Make the function that scores actions by a Q-network, given the states' features. Call it without gradients.
+    Make the function that scores actions by a Q-network, given the states' features. Both are called without gradients.
 
     Networks that begin with a linear layer, as all of SB3's do, are scored without repeating the features for
     every action: ``W [s, a] + b = (W_s s + b) + W_a a``, whose first part is computed once per state.
 
     :param q_network: maps features and actions side by side, (rows, F + A), to values, (rows, 1)
     :param features: the states' features, (B, F)
-    :param dtype: data type of the hidden layers' products, which bfloat16 may make faster. Everything else is float32,
-        and so is all where states are few, or where a network has other layers than linear ones and rectifiers between them.
-    :return: the scoring function, (B, N, A) -> (B, N), without gradients
+    :param dtype: data type of all layers' products but the last one's, which bfloat16 may make faster. Everything else is
+        float32, and so is all where states are few, or where a network has other layers than linear ones and rectifiers
+        between them.
+    :return: the scoring function, (B, N, A) -> (B, N)
     """
     if features.device.type == "cpu":
         _keep_freed_memory()
@@ -103,7 +104,7 @@ def _score_by_parts(q_network: nn.Sequential, features: th.Tensor) -> Score:
     first, *following = q_network
     assert isinstance(first, nn.Linear)
     state_part, action_weight = _split(first, features)
-    layers = _prepare(following)
+    layers = [_prepare(module) for module in following]
 
     def score(actions: th.Tensor) -> th.Tensor:
         def score_block(block_actions: th.Tensor, block_state_part: th.Tensor) -> th.Tensor:
@@ -119,11 +120,12 @@ def _score_by_parts(q_network: nn.Sequential, features: th.Tensor) -> Score:
 
 def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: th.dtype) -> Score:
     """
-    Score by a network of linear layers and rectifiers, whose hidden layers compute in a data type of 16 bits.
+    Score by a network of linear layers and rectifiers, all of which but the last compute in a data type of 16 bits.
 
     ``relu(u + d) = relu(u) + max(d + min(u, 0), -relu(u))``, where u is what a unit has for the mean of a state's actions,
     and d by how much it differs for one of them. What follows from u is computed once per state, in float32. Only
-    differences are rounded, which CEM ranks, and not what a state's actions have in common, which may be much larger.
+    differences are rounded, which CEM ranks, and not what a state's actions have in common, which may be much larger. In the
+    first layer u is rounded, too: that matters only to units that d turns on or off, where u is the smaller of the two.
     """
     first, *hidden, last = [module for module in q_network if is_linear(module)]
     state_part, action_weight = _split(first, features)
@@ -219,19 +221,11 @@ def _lower_each(hidden: th.Tensor, ceilings: th.Tensor) -> th.Tensor:
     return hidden
 
 
-def _prepare(modules: list[nn.Module]) -> list[Layer]:
-    """Turn the modules after the first into layers."""
-    layers: list[Layer] = []
-    is_fused = False
-    for index, module in enumerate(modules):
-        if is_linear(module):
-            is_fused = type(modules[min(index + 1, len(modules) - 1)]) is nn.ReLU
-            layers.append(functools.partial(multiply, weight=module.weight, bias=module.bias, is_rectified=is_fused))
-        elif is_fused:
-            is_fused = False
-        else:
-            layers.append(th.relu_ if type(module) is nn.ReLU else module)
-    return layers
+def _prepare(module: nn.Module) -> Layer:
+    """Turn a module after the first into a layer."""
+    if is_linear(module):
+        return functools.partial(multiply, weight=module.weight, bias=module.bias)
+    return th.relu_ if type(module) is nn.ReLU else module
 
 
 def _is_rectifier_network(q_network: nn.Sequential) -> bool:

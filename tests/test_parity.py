@@ -147,7 +147,7 @@ def test_memory_efficient_replay():
 def test_action_noise_is_added_to_cems_actions(noise_class):
     class Idle:
         def select(self, score, n_states, action_dim, device="cpu"):
-            return Selection(th.zeros(n_states, action_dim), th.zeros(n_states, action_dim))
+            return Selection(th.zeros(n_states, action_dim), th.zeros(n_states, 1, action_dim))
 
     noise = noise_class(np.zeros(1), 0.2 * np.ones(1))
     for action_noise, idle in ((noise, False), (None, True)):

@@ -46,8 +46,8 @@ def outcome(network, inputs):
 @pytest.mark.parametrize("rows", [1, MANY_ROWS, 200])
 @pytest.mark.parametrize("with_onednn", [True, False])
 def test_values_and_gradients_are_those_of_the_sequence(monkeypatch, name, rows, with_onednn):
-    if not with_onednn:
-        monkeypatch.setattr(products, "onednn_linear", lambda dtype: None)
+    # Or for all products, however small
+    monkeypatch.setattr(products, "MANY_MULTIPLICATIONS", 1 if with_onednn else th.inf)
     network = Perceptron(*copy.deepcopy(NETWORKS[name]))
     # Batch norm takes no batch of one for training
     network.train(rows > 1)
@@ -91,6 +91,34 @@ def test_a_second_derivative_is_refused_rather_than_wrong():
     (gradient,) = th.autograd.grad(network(inputs).square().sum(), inputs, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         gradient.sum().backward()
+
+
+def test_autocast_is_pytorchs():
+    network, inputs = Perceptron(*copy.deepcopy(NETWORKS["wide"])), th.randn(256, N_INPUTS)
+    with th.autocast("cpu", dtype=th.bfloat16):
+        outputs = network(inputs)
+    assert outputs.dtype == th.bfloat16
+    outputs.float().sum().backward()
+    assert network[0].weight.grad is not None
+
+
+@pytest.mark.parametrize("where", ["inputs", "weight"])
+def test_nan_is_passed_on(where):
+    network, inputs = Perceptron(*copy.deepcopy(NETWORKS["wide"])), th.randn(256, N_INPUTS)
+    with th.no_grad():
+        (inputs if where == "inputs" else network[2].weight)[:] = th.nan
+        assert network(inputs).isnan().all()
+
+
+@th.no_grad()
+def test_tracing_sees_the_modules():
+    network, inputs = Perceptron(*copy.deepcopy(NETWORKS["wide"])), th.randn(MANY_ROWS, N_INPUTS)
+    traced = th.jit.trace(network, inputs)
+    assert "aten::linear" in str(traced.inlined_graph)
+    assert "_linear_pointwise" not in str(traced.inlined_graph)
+    exported = th.export.export(network, (inputs,))
+    assert "_linear_pointwise" not in str(exported.graph)
+    th.testing.assert_close(exported.module()(inputs), network(inputs))
 
 
 def test_parameters_have_the_names_that_td3_gives_them():

@@ -41,9 +41,11 @@ NETWORKS = {
 @pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize(("n_states", "n_actions"), [(1, 1), (5, 9), (64, 33)])
 @pytest.mark.parametrize("block_size", [1, 200, scoring.BLOCK_SIZE])
+@pytest.mark.parametrize("with_onednn", [True, False])
 @th.no_grad()
-def test_fast_and_plain_scores_agree(monkeypatch, name, n_states, n_actions, block_size):
+def test_fast_and_plain_scores_agree(monkeypatch, name, n_states, n_actions, block_size, with_onednn):
     monkeypatch.setattr(scoring, "BLOCK_SIZE", block_size)
+    monkeypatch.setattr(products, "MANY_MULTIPLICATIONS", 1 if with_onednn else th.inf)
     features = th.randn(n_states, N_FEATURES)
     actions = th.rand(n_states, n_actions, ACTION_DIM) * 2 - 1
     fast = q_score(NETWORKS[name], features)(actions)
@@ -114,9 +116,9 @@ def rounded_differences(network, features, actions):
 @pytest.mark.parametrize("with_onednn", [True, False])
 @pytest.mark.parametrize("net_arch", [[32, 16], [32, 64, 16], [64, 64, 64, 64]])
 @th.no_grad()
-def test_bfloat16_rounds_differences_between_actions_and_nothing_else(monkeypatch, with_onednn, net_arch):
-    if not with_onednn:
-        monkeypatch.setattr(products, "onednn_linear", lambda dtype: None)
+def test_bfloat16_rounds_what_its_definition_says_and_nothing_else(monkeypatch, with_onednn, net_arch):
+    # Or for all products, however small
+    monkeypatch.setattr(products, "MANY_MULTIPLICATIONS", 1 if with_onednn else th.inf)
     network = mlp(net_arch)
     features = th.randn(scoring.MANY_STATES, N_FEATURES)
     actions = th.rand(scoring.MANY_STATES, 6, ACTION_DIM) * 2 - 1
@@ -199,6 +201,7 @@ def test_without_onednn_scores_are_the_same(monkeypatch, reason):
     else:
         functions = SimpleNamespace() if reason == "no such function" else SimpleNamespace(_linear_pointwise=refuse)
         monkeypatch.setattr(th.ops, "mkldnn", functions)
+    monkeypatch.setattr(products, "MANY_MULTIPLICATIONS", 1)
     products.onednn_linear.cache_clear()
     try:
         assert products.onednn_linear(th.float32) is None
@@ -235,7 +238,7 @@ for dtype in (th.float32, th.bfloat16):
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries keep freed memory in their own way")
 def test_calls_take_no_fresh_memory_from_the_system():
-    # In a process of its own, as what is kept depends on all that a process has freed. A block of activations has 256 pages
+    # In a process of its own, as what is kept depends on all that a process has freed. A block of activations has 512 pages
     counts = subprocess.run([sys.executable, "-c", COUNT_FRESH_PAGES], check=True, capture_output=True, text=True).stdout
     assert all(float(count) < 128 for count in counts.split())
     assert len(counts.split()) == 2

@@ -23,7 +23,7 @@ class TargetActorPolicy(CGPPolicy):
     def select_actions(self, observation, critic):
         with th.no_grad():
             actions = self.actor_target(observation)
-        return Selection(actions, th.zeros_like(actions))
+        return Selection(actions, actions.unsqueeze(1))
 
 
 def parameters_of(model):
@@ -136,7 +136,8 @@ class FixedSelector:
         self.action = action
 
     def select(self, score, n_states, action_dim, device="cpu"):
-        return Selection(th.full((n_states, action_dim), self.action), th.zeros(n_states, action_dim))
+        actions = th.full((n_states, action_dim), self.action)
+        return Selection(actions, actions.unsqueeze(1))
 
 
 def test_cgp_loss_pulls_the_actor_to_the_selector_whatever_the_critic():
@@ -234,6 +235,19 @@ def test_a_nan_in_the_first_observation_or_in_a_final_one_stops_training():
         CGP("MlpPolicy", BlindAtTheEnd(5, True), buffer_size=10).learn(10)
 
 
+@pytest.mark.parametrize("where", ["observations", "weights"])
+def test_nan_is_seen_in_batches_and_networks_of_any_size(where):
+    # Large enough for the products that are not PyTorch's usual ones, which might take NaN for zero
+    model = filled_model(policy_kwargs=dict(net_arch=[256, 256]), cem_samples=8, cem_elites=2)
+    if where == "observations":
+        model.replay_buffer.observations[:] = np.nan
+    else:
+        with th.no_grad():
+            model.critic.q_networks[0][2].weight[3, 5] = th.nan
+    with pytest.raises(ValueError, match="The critic loss is nan at gradient step 1"):
+        model.train(gradient_steps=1, batch_size=128)
+
+
 @pytest.mark.parametrize("network", ["critic", "actor"])
 def test_a_nan_loss_stops_training_before_the_network_is_ruined(network):
     model = filled_model(policy_loss="qgp")
@@ -241,7 +255,7 @@ def test_a_nan_loss_stops_training_before_the_network_is_ruined(network):
         model.replay_buffer.rewards[:] = np.inf
     else:
         model.policy.select_actions = lambda observation, critic: Selection(
-            th.zeros(len(observation), 1), th.zeros(len(observation), 1)
+            th.zeros(len(observation), 1), th.zeros(len(observation), 1, 1)
         )
         model.critic.q1_forward = lambda observations, actions: actions * th.nan
     before = {name: parameter.clone() for name, parameter in getattr(model, network).state_dict().items()}
