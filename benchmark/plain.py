@@ -4,6 +4,7 @@ import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_cgp.cem import Selection
 from sb3_cgp.policies import CGPPolicy
@@ -14,8 +15,12 @@ class PlainPolicy(CGPPolicy):
     """
     CGP's policy with the observation repeated for every sample, in float32, one operation at a time.
 
-    It takes the critic in the mode that it finds it in: right only for networks without dropout and batch norm.
+    Its networks are SB3's. It takes the critic in the mode that it finds it in: right only for networks without dropout and
+    batch norm.
     """
+
+    make_actor = TD3Policy.make_actor
+    make_critic = TD3Policy.make_critic
 
     @th.no_grad()
     def select_actions(self, observation: PyTorchObs, critic: ContinuousCritic) -> Selection:

@@ -172,7 +172,9 @@ def _split(first: nn.Linear, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]
     """Split a first layer into the states' part, (B, 1, H), and the weights of the actions' part, (A, H)."""
     n_features = features.shape[1]
     state_part = F.linear(features, first.weight[:, :n_features], first.bias).unsqueeze(1)
-    return state_part, first.weight[:, n_features:].t().contiguous()
+    action_weight = first.weight[:, n_features:].t()
+    # The copy pays off where it is read more than once
+    return state_part, action_weight if features.shape[0] == 1 else action_weight.contiguous()
 
 
 def _in_blocks(score_block: Callable[..., th.Tensor], width: int, actions: th.Tensor, *of_states: th.Tensor) -> th.Tensor:

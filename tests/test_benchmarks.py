@@ -11,6 +11,7 @@ import torch as th
 from gymnasium.utils.env_checker import check_env
 from matplotlib.image import imread
 from stable_baselines3.common.env_util import make_vec_env
+from torch import nn
 
 from benchmark import arguments, contenders, latency, products, runtime, scaling, selector
 from benchmark.boxes import BoxEnv
@@ -116,6 +117,8 @@ def test_plain_policy_selects_what_the_fast_one_selects():
 
 def test_plain_policy_repeats_every_observation():
     model = CGP(PlainPolicy, make_vec_env("Pendulum-v1"), buffer_size=10, cem_samples=8, cem_iterations=3)
+    # By PyTorch's modules alone
+    assert all(type(network) is nn.Sequential for network in (model.actor.mu, *model.critic.q_networks))
     rows = []
     first = model.critic.q_networks[0][0]
     first.register_forward_hook(lambda layer, inputs, output: rows.append(inputs[0].shape))
