@@ -228,17 +228,18 @@ th.set_num_threads(2)
 network, features = th.nn.Sequential(*create_mlp(23, 1, [256, 256])), th.randn(128, 17)
 for dtype in (th.float32, th.bfloat16):
     with th.no_grad():
-        for call in range(8):
-            if call == 3:
+        for call in range(30):
+            if call == 10:
                 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
             CEM().select(q_score(network, features, dtype), 128, 6)
-    print((resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) / 5)
+    print((resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) / 20)
 """
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries keep freed memory in their own way")
 def test_calls_take_no_fresh_memory_from_the_system():
-    # In a process of its own, as what is kept depends on all that a process has freed. A block of activations has 512 pages
+    # In a process of its own, as what is kept depends on all that a process has freed. A block of activations has 512 pages,
+    # and a few calls may still take one, until the heap has grown to what it needs
     counts = subprocess.run([sys.executable, "-c", COUNT_FRESH_PAGES], check=True, capture_output=True, text=True).stdout
     assert all(float(count) < 128 for count in counts.split())
     assert len(counts.split()) == 2
