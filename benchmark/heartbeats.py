@@ -13,6 +13,9 @@ from optuna.trial import FrozenTrial, TrialState
 
 from benchmark.storages import patiently
 
+# Seconds between two heartbeats, and until a silent process is given up, by default
+BEAT, GRACE = 5.0, 60.0
+
 # The attribute of a trial that changes while its process is alive
 PROGRESS = "progress"
 

@@ -1,5 +1,6 @@
 """Processes that work for another: how they are started, are told to end, and heed it."""
 
+import argparse
 import os
 import signal
 import subprocess
@@ -7,8 +8,39 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 
+from benchmark.arguments import count
+from benchmark.heartbeats import BEAT, GRACE
+from benchmark.storages import DEFAULT_STORAGE
+
 # The exit code of a process that was told to end
 TERMINATED = 128 + signal.SIGTERM
+
+
+def add_workers(parser: argparse.ArgumentParser, logs: str) -> None:
+    """
+    Let a command line say where a study is, and what works it off.
+
+    :param parser: the command's parser
+    :param logs: where the runs go by default
+    """
+    parser.add_argument(
+        "--storage", default=DEFAULT_STORAGE, help="a database's URL, or grpc://host:port (default: %(default)s)"
+    )
+    parser.add_argument("--workers", type=count, default=1, help="processes on this machine (default: %(default)s)")
+    parser.add_argument("--threads", type=count, help="PyTorch's threads in each (default: the cores' share)")
+    parser.add_argument("--device", default="auto", help="where the networks compute (default: %(default)s)")
+    parser.add_argument("--logs", type=Path, default=Path(logs), help="where the runs go (default: %(default)s)")
+    add_heartbeats(parser)
+
+
+def add_heartbeats(parser: argparse.ArgumentParser) -> None:
+    """
+    Let a command line say how a process that was killed is noticed.
+
+    :param parser: the command's parser
+    """
+    parser.add_argument("--beat", type=float, default=BEAT, help="seconds between two heartbeats (default: %(default)s)")
+    parser.add_argument("--grace", type=float, default=GRACE, help="seconds until a silent process is given up")
 
 
 def share_of_cores(n_workers: int) -> int:

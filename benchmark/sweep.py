@@ -20,13 +20,12 @@ from benchmark.arguments import count, hyperparameter, output_folder
 from benchmark.experiments import Sweep, included_sweeps, load_sweep
 from benchmark.exports import ended_runs, export_study, without_places
 from benchmark.figures import figures, study_folders
-from benchmark.processes import share_of_cores, start_workers, stop, terminate
+from benchmark.processes import add_workers, share_of_cores, start_workers, stop, terminate
 from benchmark.progress import Tally, display
 from benchmark.provenance import conditions
-from benchmark.storages import DEFAULT_STORAGE, STORAGE_ERRORS, open_storage, reason_of
+from benchmark.storages import STORAGE_ERRORS, open_storage, reason_of
 from benchmark.studies import Ledger
 from benchmark.sweep_files import SweepError
-from benchmark.worker import BEAT, GRACE
 
 # Seconds between two looks at the study
 LOOK = 2.0
@@ -144,21 +143,11 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("--eval-episodes", type=count, help="episodes of each evaluation, in place of the file's")
     parser.add_argument("--study", help="the study's name (default: the sweep's, with the tasks if they were replaced)")
-    parser.add_argument(
-        "--storage", default=DEFAULT_STORAGE, help="a database's URL, or grpc://host:port (default: %(default)s)"
-    )
-    parser.add_argument("--workers", type=count, default=1, help="processes on this machine (default: %(default)s)")
-    parser.add_argument("--threads", type=count, help="PyTorch's threads in each (default: the cores' share)")
-    parser.add_argument("--device", default="auto", help="where the networks compute (default: %(default)s)")
-    parser.add_argument("--logs", type=Path, default=Path("logs/sweeps"), help="where the runs go (default: %(default)s)")
+    add_workers(parser, "logs/sweeps")
     parser.add_argument("--results", type=output_folder, default="benchmark/results/sweeps", help="where the results go")
     parser.add_argument(
         "--adopt", action="store_true", help="take the ended runs that the folder of results has, trained elsewhere"
     )
-    parser.add_argument(
-        "--beat", type=float, default=BEAT, help="seconds between a worker's heartbeats (default: %(default)s)"
-    )
-    parser.add_argument("--grace", type=float, default=GRACE, help="seconds until a silent worker is given up")
     args = parser.parse_args(argv)
     args.threads = args.threads or share_of_cores(args.workers)
     return args

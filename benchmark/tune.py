@@ -20,12 +20,12 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
 from benchmark.arguments import count, hyperparameter
 from benchmark.entries import base_entry, write_entry
-from benchmark.processes import TERMINATED, listen, share_of_cores, start_workers, stop, terminate
-from benchmark.storages import DEFAULT_STORAGE, STORAGE_ERRORS, open_storage, patiently, reason_of
+from benchmark.processes import TERMINATED, add_workers, listen, share_of_cores, start_workers, stop, terminate
+from benchmark.storages import STORAGE_ERRORS, open_storage, patiently, reason_of
 from benchmark.studies import ERROR
 from benchmark.sweep_files import SweepError, known_task
 from benchmark.tuning import PRUNERS, SCORES, SCORING, Tuner, Tuning, best_of, is_over
-from benchmark.worker import BEAT, GRACE, PAUSE
+from benchmark.worker import PAUSE
 from sb3_cgp.zoo import register
 
 # Seconds between two looks at the study
@@ -163,17 +163,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--eval-episodes", type=count, default=5, help="episodes of each (default: %(default)s)")
     parser.add_argument("--write", type=Path, help="a YAML file of rl_zoo3's, for the best configuration")
     parser.add_argument("--study", help="the study's name (default: tune, the algorithm and the environment)")
-    parser.add_argument(
-        "--storage", default=DEFAULT_STORAGE, help="a database's URL, or grpc://host:port (default: %(default)s)"
-    )
-    parser.add_argument("--workers", type=count, default=1, help="processes on this machine (default: %(default)s)")
-    parser.add_argument("--threads", type=count, help="PyTorch's threads in each (default: the cores' share)")
-    parser.add_argument("--device", default="auto", help="where the networks compute (default: %(default)s)")
-    parser.add_argument("--logs", type=Path, default=Path("logs/tuning"), help="where the runs go (default: %(default)s)")
-    parser.add_argument(
-        "--beat", type=float, default=BEAT, help="seconds between a process's heartbeats (default: %(default)s)"
-    )
-    parser.add_argument("--grace", type=float, default=GRACE, help="seconds until a silent process is given up")
+    add_workers(parser, "logs/tuning")
     parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
     args.threads = args.threads or share_of_cores(args.workers)

@@ -19,14 +19,12 @@ import torch as th
 from filelock import FileLock
 
 from benchmark.arguments import count
-from benchmark.heartbeats import Heart, TrialLostError
-from benchmark.processes import TERMINATED, listen
+from benchmark.heartbeats import BEAT, Heart, TrialLostError
+from benchmark.processes import TERMINATED, add_heartbeats, listen
 from benchmark.run import forget_states, run_folder, train
 from benchmark.storages import STORAGE_ERRORS, open_storage, patiently
 from benchmark.studies import Claim, Ledger
 
-# Seconds between two heartbeats, and until a silent process is given up, by default
-BEAT, GRACE = 5.0, 60.0
 # Seconds between two looks at a study of which no run waits
 PAUSE = 2.0
 
@@ -98,8 +96,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--logs", type=Path, required=True, help="the folder of all sweeps' runs")
     parser.add_argument("--threads", type=count, default=1, help="PyTorch's threads (default: %(default)s)")
     parser.add_argument("--device", default="auto", help="where the networks compute (default: %(default)s)")
-    parser.add_argument("--beat", type=float, default=BEAT, help="seconds between two heartbeats (default: %(default)s)")
-    parser.add_argument("--grace", type=float, default=GRACE, help="seconds until a silent process is given up")
+    add_heartbeats(parser)
     parser.add_argument("--parent", type=int, help="the process after which this one is to end, too")
     return parser.parse_args(argv)
 
