@@ -9,10 +9,10 @@ import time
 import numpy as np
 import pytest
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.callbacks import CallbackList, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainings import SMALL
+from trainings import SMALL, Do
 
 from sb3_cgp import CGP
 from sb3_cgp.callbacks import TrainingCheckpointCallback
@@ -22,19 +22,6 @@ from sb3_cgp.store import StateStore
 def make_model(**arguments):
     arguments = dict(env=make_vec_env("Pendulum-v1", seed=1), policy_kwargs=dict(net_arch=[8])) | SMALL | arguments
     return CGP("MlpPolicy", **arguments)
-
-
-class Do(BaseCallback):
-    """Calls a function at a step, of the environment or, offline, of the policy's training."""
-
-    def __init__(self, step, function):
-        super().__init__()
-        self.step, self.function = step, function
-
-    def _on_step(self):
-        if self.n_calls == self.step:
-            self.function()
-        return True
 
 
 def terminate():

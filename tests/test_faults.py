@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from environments import Doubles
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from trainings import Do
 
 from sb3_cgp import CGP
 from sb3_cgp.callbacks import TrainingCheckpointCallback
@@ -80,19 +81,6 @@ def is_running(pid: int) -> bool:
     return True
 
 
-class AtStep(BaseCallback):
-    """Calls a function once, at a step."""
-
-    def __init__(self, step, function):
-        super().__init__()
-        self.step, self.function = step, function
-
-    def _on_step(self):
-        if self.n_calls == self.step:
-            self.function()
-        return True
-
-
 def assert_buried(env):
     """No worker is left, and closing the environment neither hangs nor raises."""
     assert not any(is_running(process.pid) for process in env.processes)
@@ -146,7 +134,7 @@ def test_a_worker_that_dies_during_a_gradient_step_is_named():
     env = subproc(None, None)
     model = CGP("MlpPolicy", env, **SMALL)
     with pytest.raises(RuntimeError, match=r"worker 1 .* was killed by signal 15"):
-        model.learn(300, AtStep(20, env.processes[1].terminate))
+        model.learn(300, Do(20, env.processes[1].terminate))
     assert_buried(env)
 
 
@@ -171,7 +159,7 @@ def test_an_interruption_from_the_keyboard_that_ends_workers_leaves_an_environme
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        CGP("MlpPolicy", env, **SMALL).learn(300, AtStep(20, interrupt))
+        CGP("MlpPolicy", env, **SMALL).learn(300, Do(20, interrupt))
     assert_buried(env)
 
 
@@ -278,7 +266,7 @@ def test_the_bounds_of_each_part_of_an_observation_are_watched():
 def learn(folder, fault=None, at=73, model=None, function=None):
     """Train for 150 steps, the state saved after every 20, with a fault of the environment or of the process."""
     model = CGP("MlpPolicy", Failing(fault, at), **SMALL, seed=0) if model is None else model
-    return model.learn(150, [TrainingCheckpointCallback(20, folder), AtStep(at if function else None, function)])
+    return model.learn(150, [TrainingCheckpointCallback(20, folder), Do(at if function else None, function)])
 
 
 def assert_resumes(folder, step, expected):

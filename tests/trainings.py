@@ -20,6 +20,19 @@ class Interruption(Exception):
     """Whatever may end a training."""
 
 
+class Do(BaseCallback):
+    """Calls a function at a step, of the environment or, offline, of the policy's training."""
+
+    def __init__(self, step, function):
+        super().__init__()
+        self.step, self.function = step, function
+
+    def _on_step(self):
+        if self.n_calls == self.step:
+            self.function()
+        return True
+
+
 class Stop(BaseCallback):
     """
     Interrupts the training. On the way it draws from Python's generator, and logs the mean since it was last written.
