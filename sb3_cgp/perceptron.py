@@ -6,7 +6,7 @@ import torch as th
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from sb3_cgp.products import is_hooked, is_linear, multiply
+from sb3_cgp.products import multiply, rectified_layers
 
 # Rows from which on there is something to gain
 MANY_ROWS = 32
@@ -27,7 +27,7 @@ class Perceptron(nn.Sequential):
         :param inputs: the batch, (rows, inputs)
         :return: the outputs, (rows, outputs)
         """
-        layers = self._layers() if _is_for_us(inputs) else []
+        layers = rectified_layers(self) if _is_for_us(inputs) else []
         if not layers:
             return super().forward(inputs)
         parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
@@ -35,16 +35,6 @@ class Perceptron(nn.Sequential):
         for module in list(self)[2 * len(layers) - 1 :]:
             outputs = module(outputs)
         return outputs
-
-    def _layers(self) -> list[nn.Linear]:
-        """List the linear layers that follow one another with nothing but rectifiers between them, none of them hooked."""
-        layers: list[nn.Linear] = []
-        for index, module in enumerate(self):
-            if is_hooked(module) or not (is_linear(module) if index % 2 == 0 else type(module) is nn.ReLU):
-                break
-            if is_linear(module):
-                layers.append(module)
-        return layers
 
 
 def _is_for_us(inputs: th.Tensor) -> bool:

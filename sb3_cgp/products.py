@@ -1,7 +1,7 @@
 """Products with the weights of linear layers, by the fastest function that PyTorch has for them."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TypeGuard
 
 import torch as th
@@ -75,3 +75,19 @@ def is_hooked(module: nn.Module) -> bool:
     """
     # PyTorch has no public way to ask
     return bool(module._forward_hooks or module._forward_pre_hooks or module._backward_hooks or module._backward_pre_hooks)
+
+
+def rectified_layers(modules: Iterable[nn.Module]) -> list[nn.Linear]:
+    """
+    List the linear layers at the beginning that follow one another with nothing but rectifiers between them, none hooked.
+
+    :param modules: the modules of a sequence
+    :return: the layers
+    """
+    layers: list[nn.Linear] = []
+    for index, module in enumerate(modules):
+        if is_hooked(module) or not (is_linear(module) if index % 2 == 0 else type(module) is nn.ReLU):
+            break
+        if is_linear(module):
+            layers.append(module)
+    return layers

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from sb3_cgp.cem import Score
 from sb3_cgp.perceptron import Perceptron
-from sb3_cgp.products import is_hooked, is_linear, multiply
+from sb3_cgp.products import is_hooked, is_linear, multiply, rectified_layers
 
 # Hidden activations of one block: about what stays in the caches near one or two cores (2 MiB of float32)
 BLOCK_SIZE = 2**19
@@ -127,7 +127,7 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
     differences are rounded, which CEM ranks, and not what a state's actions have in common, which may be much larger. In the
     first layer u is rounded, too: that matters only to units that d turns on or off, where u is the smaller of the two.
     """
-    first, *hidden, last = [module for module in q_network if is_linear(module)]
+    first, *hidden, last = rectified_layers(q_network)
     state_part, action_weight = _split(first, features)
     # The first of them is given differences with their signs turned
     weights = [-hidden[0].weight.to(dtype), *(layer.weight.to(dtype) for layer in hidden[1:])]
@@ -232,9 +232,8 @@ def _prepare(module: nn.Module) -> Layer:
 
 def _is_rectifier_network(q_network: nn.Sequential) -> bool:
     """Whether a network has linear layers alone, at least three, and rectifiers between them."""
-    linear, rectifiers = list(q_network)[::2], list(q_network)[1::2]
-    alternates = all(map(is_linear, linear)) and all(type(module) is nn.ReLU for module in rectifiers)
-    return alternates and len(linear) == len(rectifiers) + 1 > 2
+    n_layers = len(rectified_layers(q_network))
+    return n_layers > 2 and len(q_network) == 2 * n_layers - 1
 
 
 def _begins_with_linear(q_network: nn.Module) -> TypeGuard[nn.Sequential]:
