@@ -16,8 +16,8 @@ from sb3_cgp.cem import Score
 from sb3_cgp.perceptron import Perceptron
 from sb3_cgp.products import is_hooked, is_linear, multiply, rectified_layers
 
-# Hidden activations of one block: about what stays in the caches near one or two cores (2 MiB of float32)
-BLOCK_SIZE = 2**19
+# Hidden activations of one block, in bytes for each thread: about what stays in the cache near a core
+BLOCK_BYTES = 2**20
 
 # Bytes of a block of memory that makes the C library keep what is freed
 KEPT_MEMORY = 2**24
@@ -160,7 +160,7 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
             for weight, block_offset, block_floor in zip(weights[1:], block_offsets, block_floors, strict=False):
                 different.unflatten(0, block_actions.shape[:2]).add_(block_offset)
                 different = multiply(_raise_each(different, block_floor).to(dtype), weight).to(actions.dtype)
-            return F.linear(_raise_each(different, block_floors[-1]), last.weight)
+            return th.mv(_raise_each(different, block_floors[-1]), last.weight[0])
 
         values = _in_blocks(score_block, width, different_actions, first_weights, ceilings, *offsets, *floors)
         return values.add_(common_values)
@@ -188,9 +188,12 @@ def _in_blocks(score_block: Callable[..., th.Tensor], width: int, actions: th.Te
     :return: the values, (B, N)
     """
     n_states, n_actions, _ = actions.shape
+    step = n_states
     # Only a CPU gains from blocks: on a GPU one large product is the fastest
-    rows = BLOCK_SIZE // width if actions.device.type == "cpu" else n_states * n_actions
-    step = max(rows // n_actions, 1)
+    if actions.device.type == "cpu":
+        # Results may be twice as wide, and are to stay well within the memory that is kept
+        n_bytes = min(BLOCK_BYTES * th.get_num_threads(), KEPT_MEMORY // 4)
+        step = max(n_bytes // (width * actions.element_size() * n_actions), 1)
     if step >= n_states:
         return score_block(actions, *of_states).view(n_states, n_actions)
     blocks = zip(*(tensor.split(step) for tensor in (actions, *of_states)), strict=True)

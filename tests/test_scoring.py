@@ -40,11 +40,11 @@ NETWORKS = {
 
 @pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize(("n_states", "n_actions"), [(1, 1), (5, 9), (64, 33)])
-@pytest.mark.parametrize("block_size", [1, 200, scoring.BLOCK_SIZE])
+@pytest.mark.parametrize("block_bytes", [1, 400, scoring.BLOCK_BYTES])
 @pytest.mark.parametrize("with_onednn", [True, False])
 @th.no_grad()
-def test_fast_and_plain_scores_agree(monkeypatch, name, n_states, n_actions, block_size, with_onednn):
-    monkeypatch.setattr(scoring, "BLOCK_SIZE", block_size)
+def test_fast_and_plain_scores_agree(monkeypatch, name, n_states, n_actions, block_bytes, with_onednn):
+    monkeypatch.setattr(scoring, "BLOCK_BYTES", block_bytes)
     monkeypatch.setattr(products, "MANY_MULTIPLICATIONS", 1 if with_onednn else th.inf)
     features = th.randn(n_states, N_FEATURES)
     actions = th.rand(n_states, n_actions, ACTION_DIM) * 2 - 1
