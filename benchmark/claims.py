@@ -43,9 +43,9 @@ or *{CONTRADICTED}* if the whole 95 % interval lies on its side or on the other,
 fewer than {FEWEST_RUNS} runs or a configuration only one; of several parts, all must be supported, and one is enough to
 contradict. *Spread* is the interquartile range of final rewards over all configurations and seeds: a method that fails
 everywhere has none, too, so read it with the stability curve. *At least as good* and *equal* allow {MARGIN:g} of the range,
-*fails* means that the mean loses {FAILURE:g} of it, *independent* allows {COST_MARGIN:.0%}. "Best or second best" is among
-{OURS} and all methods but its variants, {IMITATED} and {RANDOM}, in studies that vary no hyperparameter; the lead is the
-lowest over tasks."""
+*independent* allows {COST_MARGIN:.0%}. *Fails* means that the mean loses {FAILURE:g} of the range against the best of the
+other values, chosen by these data, where all else is equal. "Best or second best" is among {OURS} and all methods but its
+variants, {IMITATED} and {RANDOM}, in studies that vary no hyperparameter, on each task by itself."""
 
 
 @dataclass(frozen=True)
@@ -133,34 +133,27 @@ def findings(table: pd.DataFrame, runtime: dict[str, Any] | None, repetitions: i
 
 def best_or_second(table: pd.DataFrame, repetitions: int) -> list[Part]:
     """
-    Test whether at most one rival is better on every task: by the lead over the second best rival.
+    Test whether at most one rival is better: by the lead over the second best rival.
 
     :param table: the scores of runs that vary no hyperparameter
     :param repetitions: how often the bootstrap draws runs
-    :return: the comparison, if there is a task with two rivals
+    :return: a comparison for each task of each study that has two rivals
     """
-    groups: list[list[np.ndarray]] = []
-    numbers, ranks = [], []
-    for task, runs in table.groupby("task", sort=False):
+
+    def lead(ours: np.ndarray, *theirs: np.ndarray) -> np.ndarray:
+        return interquartile_mean(ours) - np.sort([interquartile_mean(each) for each in theirs], axis=0)[-2]
+
+    parts = []
+    for _, runs in table.groupby("cell", sort=False):
         rivals = sorted(set(runs["method"]) - {*FAMILY, IMITATED, RANDOM})
         if OURS in set(runs["method"]) and len(rivals) >= 2:
-            cells = [cells_of(runs[runs["method"] == method], "share") for method in (OURS, *rivals)]
-            means = [float(interquartile_mean(np.concatenate(cell)[None])[0]) for cell in cells]
-            ranks.append(f"{1 + sum(mean > means[0] for mean in means[1:])} of {len(means)} on {task}")
-            groups += cells
-            numbers.append(len(cells))
-    if not groups:
-        return []
-
-    def lowest_lead(*pooled: np.ndarray) -> np.ndarray:
-        means = np.stack([interquartile_mean(scores) for scores in pooled])
-        tasks = np.split(means, np.cumsum(numbers)[:-1])
-        return np.min([ours - np.sort(theirs, axis=0)[-2] for ours, *theirs in tasks], axis=0)
-
-    found = estimate(lowest_lead, groups, repetitions)
-    return [
-        Part(f"rank {', '.join(ranks)}; lowest lead over the third best {found.in_words('.3f')}", judge(found, more_than=0))
-    ]
+            found = compare(runs, (OURS, *rivals), lead, repetitions=repetitions)
+            assert found is not None
+            means = _each(runs, (OURS, *rivals), interquartile_mean)
+            rank = 1 + sum(mean > means[0] for mean in means[1:])
+            text = f"rank {rank} of {len(means)} on {runs['task'].iloc[0]}, lead over the second best rival {found.in_words('.3f')}"
+            parts.append(Part(text, judge(found, more_than=0)))
+    return parts
 
 
 def narrower(table: pd.DataFrame, repetitions: int) -> list[Part]:
@@ -224,7 +217,7 @@ def inference_cost(runtime: dict[str, Any] | None, repetitions: int) -> list[Par
     few, many = min(ours), max(ours)
     # The methods take turns: what slows a round down slows down both
     found = estimate(lambda ratios: np.median(ratios, axis=1), [[ours[many] / ours[few]]], repetitions)
-    text = f"acting after {many} iterations takes {found.in_words()} times as long as after {few}"
+    text = f"by `benchmark.runtime`, acting after {many} iterations takes {found.in_words()} times as long as after {few}"
     cem = seconds("CEM-")
     if {few, many} <= set(cem):
         text += f" (CEM itself {np.median(cem[many] / cem[few]):.2f} times)"
@@ -237,10 +230,10 @@ def high_rate_fails(table: pd.DataFrame, repetitions: int) -> list[Part]:
 
     :param table: the scores of runs that vary hyperparameters
     :param repetitions: how often the bootstrap draws runs
-    :return: the comparison with all other rates, if both were run
+    :return: the comparison with the best of the other rates, if both were run
     """
     varied = table[_has(table, LEARNING_RATE)]
-    return _fails(varied, _has_high_rate(varied), "high rates", "others", repetitions)
+    return _fails(varied, LEARNING_RATE, _has_high_rate(varied), repetitions)
 
 
 def few_steps_fail(table: pd.DataFrame, repetitions: int) -> list[Part]:
@@ -254,7 +247,7 @@ def few_steps_fail(table: pd.DataFrame, repetitions: int) -> list[Part]:
     varied = table[_has(table, INITIAL_STEPS)]
     steps = pd.Series([values[INITIAL_STEPS] for values in varied["values"]], varied.index, dtype=float)
     most = steps.groupby(varied["study"]).transform("max")
-    return _fails(varied, steps < most, "fewer", "the most", repetitions)
+    return _fails(varied, INITIAL_STEPS, steps < most, repetitions)
 
 
 def equal_variants(table: pd.DataFrame, repetitions: int) -> list[Part]:
@@ -342,14 +335,29 @@ def _listed(table: pd.DataFrame, statistic: Statistic) -> str:
     return ", ".join(f"{method} {value:.2f}" for method, value in zip(FAMILY, values, strict=True))
 
 
-def _fails(table: pd.DataFrame, bad: pd.Series, name: str, others: str, repetitions: int) -> list[Part]:
-    """Compare CGP's mean rewards between configurations, within each task of each study."""
+def _fails(table: pd.DataFrame, axis: str, is_bad: pd.Series, repetitions: int) -> list[Part]:
+    """Compare CGP's mean rewards between an axis's bad values and the best other one, in each task of each study."""
+    ours = table.assign(
+        value=[str(values[axis]) for values in table["values"]],
+        rest=[str({name: value for name, value in values.items() if name != axis}) for values in table["values"]],
+        is_bad=is_bad,
+    )[table["method"] == OURS]
     groups: list[list[np.ndarray]] = []
-    ours = table[table["method"] == OURS]
+    bad_values: list[str] = []
+    good_values: list[str] = []
     for _, runs in ours.groupby(["study", "task"], sort=False):
-        parts = [cells_of(runs[bad[runs.index] == flag], "share") for flag in (False, True)]
-        if all(parts):
-            groups += parts
+        bad, others = runs[runs["is_bad"]], runs[~runs["is_bad"]]
+        pairs = []
+        for value, good in others.groupby("value", sort=False):
+            # Where all else is equal
+            both = set(bad["rest"]) & set(good["rest"])
+            if both:
+                pairs.append((good[good["rest"].isin(both)], bad[bad["rest"].isin(both)], value))
+        if pairs:
+            good, poor, value = max(pairs, key=lambda pair: pair[0]["share"].mean())
+            groups += [cells_of(good, "share"), cells_of(poor, "share")]
+            good_values.append(str(value))
+            bad_values += map(str, poor["value"])
     if not groups:
         return []
 
@@ -361,8 +369,9 @@ def _fails(table: pd.DataFrame, bad: pd.Series, name: str, others: str, repetiti
     pooled = [np.concatenate(group) for group in groups]
     means = [float(np.mean([np.mean(scores) for scores in pooled[start::2]])) for start in (1, 0)]
     halved = sum(np.sum(poor < 0.5 * np.mean(good)) for good, poor in zip(pooled[::2], pooled[1::2], strict=True))
+    names = [" or ".join(dict.fromkeys(values)) for values in (bad_values, good_values)]
     text = (
-        f"mean {means[0]:.2f} with {name}, {means[1]:.2f} with {others}: {found.in_words()} lost; "
-        f"{halved} of {sum(map(len, pooled[1::2]))} runs below half of the others' mean"
+        f"mean {means[0]:.2f} with {names[0]}, {means[1]:.2f} with {names[1]}: {found.in_words()} lost; "
+        f"{halved} of {sum(map(len, pooled[1::2]))} runs below half of the latter"
     )
     return [Part(text, judge(found, more_than=FAILURE))]

@@ -73,6 +73,28 @@ def test_best_or_second_must_hold_on_every_task(find: Any) -> None:
     assert "3 of 3 on Reacher-v5" in found.text
 
 
+def test_second_best_by_little_on_many_tasks_is_not_contradicted(find: Any) -> None:
+    """The lowest of several leads is lower than each of them is by itself."""
+    level = {"CGP-Online": 50.0, "SAC": 60.0, "TD3": 49.0, "DDPG": 30.0}
+    draw = np.random.default_rng(0)
+    tasks = ["Pendulum-v1", "Reacher-v5", "Hopper-v5", "Ant-v5", "Swimmer-v5"]
+    records = runs(lambda method, _, seed: level[method] + draw.normal(scale=2.0), level, tasks=tasks)
+    found = find("best or second", records)
+    assert len(found.parts) == len(tasks)
+    assert found.verdict == NOT_DECIDED
+
+
+def test_ranks_are_within_a_study(tmp_path: Path) -> None:
+    """Two studies on one task, each with the second rival that the other lacks."""
+    first = runs(scores(CGP_Online=30, TD3=40), ["CGP-Online", "TD3"])
+    second = runs(scores(CGP_Online=60, SAC=40, DDPG=20), ["CGP-Online", "SAC", "DDPG"])
+    studies = [read_study(write_study(tmp_path / name, each)) for name, each in (("one", first), ("two", second))]
+    (found,) = (each for each in findings(score_table(studies), None, 200) if "best or second" in each.claim)
+    assert found.verdict == SUPPORTED
+    assert len(found.parts) == 1
+    assert "rank 1 of 3" in found.text
+
+
 def test_own_variants_and_random_actions_are_no_rivals(find: Any) -> None:
     levels = dict(CGP_Online=60, CGP_Offline=90, QGP_Online=80, CEM=85, TD3=50, SAC=40, Random=99)
     found = find("best or second", runs(scores(**levels), [name.replace("_", "-") for name in levels]))
@@ -143,6 +165,21 @@ def test_failing_settings(find: Any, axis: str, values: tuple[float, ...], claim
     found = find(claim, runs(score, ["CGP-Online", "TD3"], [{axis: value} for value in values]))
     assert found.verdict == verdict
     assert ("0 of" in found.text) == (verdict == CONTRADICTED)
+
+
+@pytest.mark.parametrize(("high", "verdict"), [(60.0, SUPPORTED), (95.0, CONTRADICTED)])
+def test_a_high_rate_is_compared_with_the_best_other_where_all_else_is_equal(find: Any, high: float, verdict: str) -> None:
+    """Neither does a rate that is too low make a high one look good, nor a batch that only one of them was run with."""
+    level = {1e-2: high, 1e-3: 100.0, 1e-4: 20.0}
+    grid = [{"learning_rate": rate, "batch_size": size} for rate in level for size in (32, 64)]
+    grid.remove({"learning_rate": 1e-2, "batch_size": 32})
+
+    def score(method: str, settings: dict[str, Any], seed: int) -> float:
+        return 0.0 if settings["batch_size"] == 32 else level[settings["learning_rate"]] - 0.1 * seed
+
+    found = find("learning rate of 0.01", runs(score, ["CGP-Online", "TD3"], grid))
+    assert found.verdict == verdict
+    assert f"mean {high / 100:.2f} with 0.01, 1.00 with 0.001" in found.text
 
 
 def test_crashes_at_a_high_rate_count(find: Any) -> None:
