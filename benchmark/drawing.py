@@ -20,7 +20,7 @@ from benchmark.estimates import (
     interquartile_mean,
     share_reaching,
 )
-from benchmark.scores import Study, axis_in_words, curves, floors, value_in_words
+from benchmark.scores import Study, axis_in_words, curves, evaluation_grid, floors, value_in_words
 from benchmark.style import styles
 
 PANEL = (4.0, 3.2)
@@ -75,7 +75,7 @@ def legend(figure: Figure, panel: Sequence[Axes], title: str | None = None) -> N
     """
     entries = {label: handle for axes in panel for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     # An entry is about as wide as half a panel
-    columns = min(len(entries), int(figure.get_figwidth() / PANEL[0] * 2.3))
+    columns = max(min(len(entries), int(figure.get_figwidth() / PANEL[0] * 2.3)), 1)
     look: dict[str, Any] = dict(loc="outside upper center", ncols=columns, frameon=False, handlelength=3.2)
     figure.legend(list(entries.values()), list(entries), title=title, **look)
 
@@ -90,12 +90,12 @@ def learning_curves(study: Study, task: str, repetitions: int = REPETITIONS) -> 
     :return: the picture, as PNG
     """
     figure, (left, right) = panels(2)
-    floor = floors(study.records)[task]
+    floor, grid = floors(study.records)[task], evaluation_grid(study.records, task)
     for method, look in styles(study.methods).items():
         records = [record for record in study.records if (record.method, record.task) == (method, task)]
-        if not records:
+        if not records or len(grid) == 0:
             continue
-        grid, lines = curves(records, floor)
+        lines = curves(records, floor, grid)
         _line(left, grid, lines.mean(axis=0), method, look)
         left.fill_between(grid, lines.min(axis=0), lines.max(axis=0), color=look["color"], alpha=0.12, linewidth=0)
         middle, interval = bootstrap(interquartile_mean, [[lines]], repetitions)
@@ -174,22 +174,21 @@ def sensitivity(study: Study, task: str) -> bytes:
     :param task: the task
     :return: the picture, as PNG
     """
-    floor = floors(study.records)[task]
+    floor, grid = floors(study.records)[task], evaluation_grid(study.records, task)
     ran = {record.method for record in study.records if record.task == task}
     methods = [method for method in study.methods if method in ran]
-    figure, grid = panels(len(methods))
-    for method, panel in zip(methods, grid, strict=True):
+    figure, drawn = panels(len(methods))
+    for method, panel in zip(methods, drawn, strict=True):
         for settings, look in _looks(study):
             records = [
                 record for record in study.records if (record.method, record.task, record.settings) == (method, task, settings)
             ]
-            if records:
-                steps, lines = curves(records, floor)
+            if records and len(grid) > 0:
                 label = " / ".join(value_in_words(value) for value in settings.values())
-                _line(panel, steps, lines.mean(axis=0), label, look)
+                _line(panel, grid, curves(records, floor, grid).mean(axis=0), label, look)
         panel.set(title=method, ylabel="return")
         _label_steps(panel)
-    legend(figure, grid, f"{task}: {' / '.join(axis_in_words(axis) for axis in study.axes)}")
+    legend(figure, drawn, f"{task}: {' / '.join(axis_in_words(axis) for axis in study.axes)}")
     return png(figure)
 
 

@@ -87,7 +87,10 @@ def write_entry(path: Path, task: str, entry: Hyperparams, comment: str) -> None
     :param comment: a line on where they come from
     :raises ValueError: if the file is not one of entries by task, or another entry refers to the one to be replaced
     """
-    text = path.read_text() if path.is_file() else ""
+    # A link stays one, and lines end as they did
+    path = path.resolve()
+    text = path.read_bytes().decode() if path.is_file() else ""
+    ending = "\r\n" if "\r\n" in text else "\n"
     try:
         before = yaml.safe_load(text) or {}
         start, end = _lines_of(task, text)
@@ -96,7 +99,7 @@ def write_entry(path: Path, task: str, entry: Hyperparams, comment: str) -> None
     body = yaml.safe_dump(entry, sort_keys=True, allow_unicode=True)
     block = [f"{task}:", f"  # {comment}", *(f"  {line}" for line in body.splitlines())]
     lines = text.splitlines()
-    after = "\n".join([*lines[:start], *block, *lines[end:]]) + "\n"
+    after = ending.join([*lines[:start], *block, *lines[end:]]) + ending
     if not isinstance(before, dict) or _loaded(after) != {**before, task: entry}:
         raise ValueError(f"{path} is not changed: its entry {task} cannot be replaced without a change of others'")
     write_atomically(path, after.encode())

@@ -15,41 +15,18 @@ from typing import Any
 from rl_zoo3 import ALGOS
 
 from benchmark.random_actions import NAME as RANDOM
+from benchmark.records import configuration_in_words, run_key
 from benchmark.sweep_files import Hyperparams, Inclusion, Method, SweepError, SweepFile, read_yaml, validated
 from sb3_cgp.zoo import hyperparams_folder
 
 METHODS_FILE = "methods.yml"
-# What rl_zoo3 takes from an entry of its YAML files for itself; the rest are the algorithm's arguments
+# What rl_zoo3 takes from an entry of its YAML files for itself, but for the steps; the rest are the algorithm's arguments
 ZOO_HYPERPARAMS = (
-    *("callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "n_timesteps", "noise_std"),
-    *("noise_type", "normalize", "policy_kwargs", "vec_env_wrapper"),
+    *("callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "noise_std", "noise_type"),
+    *("normalize", "policy_kwargs", "vec_env_wrapper"),
 )
 # Of the final model
 FINAL_EPISODES = 20
-
-
-def configuration_in_words(method: str, settings: dict[str, Any]) -> str:
-    """
-    Name a configuration.
-
-    :param method: the method
-    :param settings: the values of the axes, by axis
-    :return: the name
-    """
-    return ",".join([method, *(f"{axis}={value}" for axis, value in sorted(settings.items()))])
-
-
-def run_key(method: str, settings: dict[str, Any], task: str, seed: int) -> str:
-    """
-    Name a run as no other run of its study is named.
-
-    :param method: the method
-    :param settings: the values of the axes, by axis
-    :param task: the environment
-    :param seed: the seed
-    :return: the name
-    """
-    return f"{configuration_in_words(method, settings)},{task},seed={seed}"
 
 
 @dataclass(frozen=True)
@@ -201,7 +178,8 @@ def load_sweep(name: str, overrides: dict[str, Any] | None = None, methods: Sequ
     Read a sweep's file.
 
     :param name: one of the paper's sweeps, or the path of a file
-    :param overrides: fields of the file to replace; hyperparameters are added to the file's
+    :param overrides: fields of the file to replace; hyperparameters are added to the file's, and with other steps the
+        evaluation interval is a twentieth of them unless it is replaced, too
     :param methods: the methods to take, of those that the file names
     :return: the sweep
     :raises SweepError: if the file or an override is wrong: it names the place, the key and what is allowed
@@ -211,6 +189,9 @@ def load_sweep(name: str, overrides: dict[str, Any] | None = None, methods: Sequ
     # First the file alone, so that a mistake is said to be where it is
     file = validated(SweepFile, content, path)
     overrides = {key: value for key, value in (overrides or {}).items() if value is not None}
+    if "steps" in overrides:
+        overrides = overrides | {"evaluation_interval": overrides.get("evaluation_interval", max(overrides["steps"] // 20, 1))}
+    changed = overrides.get("hyperparams", {})
     changes = [f"{key} {value}" for key, value in overrides.items()]
     if "hyperparams" in overrides:
         overrides = overrides | {"hyperparams": file.hyperparams | overrides["hyperparams"]}
@@ -224,23 +205,29 @@ def load_sweep(name: str, overrides: dict[str, Any] | None = None, methods: Sequ
     if methods:
         changes.append(f"methods {', '.join(chosen)}")
     sweep = Sweep(path.stem, file, {method: known[method] for method in chosen}, changes)
-    _check_hyperparams(path, sweep)
+    _check_hyperparams(path, sweep, changed)
     return sweep
 
 
-def _check_hyperparams(place: object, sweep: Sweep) -> None:
+def _check_hyperparams(path: Path, sweep: Sweep, changed: Hyperparams) -> None:
     """See that each method takes what is set for it, before hours are spent."""
     for run in {run.configuration: run for run in sweep.runs()}.values():
         allowed = {*inspect.signature(ALGOS[run.algo]).parameters, *ZOO_HYPERPARAMS} - {"env", "seed", "device", "verbose"}
         for name in run.hyperparams:
             if name not in allowed and run.algo != RANDOM:
+                is_the_methods = isinstance(sweep.file.methods, list) and name in sweep.methods[run.method].hyperparams
+                place = "the command line" if name in changed else _methods_file(path) if is_the_methods else path
                 close = ", ".join(difflib.get_close_matches(name, allowed, n=3) or sorted(allowed))
                 raise SweepError(place, name, f"no hyperparameter of {run.method} ({run.algo}), which must be one of {close}")
 
 
-def _named_methods(path: Path, names: list[str]) -> dict[str, Method]:
+def _methods_file(path: Path) -> Path:
     beside = path.parent / METHODS_FILE
-    source = beside if beside.is_file() else sweeps_folder() / METHODS_FILE
+    return beside if beside.is_file() else sweeps_folder() / METHODS_FILE
+
+
+def _named_methods(path: Path, names: list[str]) -> dict[str, Method]:
+    source = _methods_file(path)
     known = {name: validated(Method, entry, source, name) for name, entry in read_yaml(source).items()}
     for name in names:
         if name not in known:

@@ -1,22 +1,19 @@
 """A study's runs as small text files, for figures and to be kept in a repository."""
 
 import json
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from optuna.trial import TrialState
+
 from benchmark.files import write_json
-from benchmark.records import Record, read_records, write_records
+from benchmark.records import RUNS, Record, read_records, write_records
 from benchmark.storages import open_storage
-from benchmark.studies import Ledger
+from benchmark.studies import Ledger, owned
 from benchmark.sweep_files import SweepError
 
 STUDY = "study.json"
-# Of what benchmark.provenance says
-CONDITIONS = ("command", "commit", "versions", "machine", "load_average")
-
-
 # Options that say where files and databases are, and may hold a password
 PRIVATE = ("--storage", "--logs", "--results")
 
@@ -46,12 +43,30 @@ def export_study(name: str, storage_url: str, results: Path) -> Path:
     :param results: the folder of all studies' results
     :return: the study's own folder, in it
     :raises KeyError: if there is no such study
+    :raises SweepError: if the folder has runs that the study lacks, which would be lost
     """
     ledger = Ledger(open_storage(storage_url), name)
     folder = results / name
+    see_that_none_is_lost(folder, ledger)
     write_json(folder / STUDY, ledger.description())
     write_records(folder, ledger.records())
     return folder
+
+
+def see_that_none_is_lost(folder: Path, ledger: Ledger) -> None:
+    """
+    See that a study has all runs that its folder of results has, before these are written anew.
+
+    :param folder: the study's folder of results
+    :param ledger: the study
+    :raises SweepError: if it lacks some
+    """
+    exported = {record.key for record in read_records(folder)} if (folder / RUNS).is_file() else set()
+    lacking = exported - {key for key, trial in owned(ledger.trials()).items() if trial.state is not TrialState.WAITING}
+    if lacking:
+        problem = f"has {len(lacking)} ended runs that the study lacks, such as {min(lacking)}"
+        remedy = "Take them by --adopt, with the methods and seeds that they are of, or choose another folder by --results"
+        raise SweepError(folder / RUNS, "", f"{problem}. {remedy}")
 
 
 def ended_runs(folder: Path, description: dict[str, Any]) -> tuple[list[Record], list[dict[str, Any]]]:
@@ -60,7 +75,7 @@ def ended_runs(folder: Path, description: dict[str, Any]) -> tuple[list[Record],
 
     :param folder: the study's folder of results
     :param description: what the sweep is
-    :return: the runs, and under which conditions they were trained, from the first to the last
+    :return: the runs, and the commands that trained them
     :raises SweepError: if they were trained with other settings, naming one
     """
     if not (folder / STUDY).is_file():
@@ -75,5 +90,4 @@ def ended_runs(folder: Path, description: dict[str, Any]) -> tuple[list[Record],
             same = was[key] == now
         if not same:
             raise SweepError(folder / STUDY, key, "differs from the sweep's, so that its runs cannot be adopted")
-    conditions = {key: was[key] for key in CONDITIONS} | {"command": shlex.join(without_places(shlex.split(was["command"])))}
-    return read_records(folder), [*was.get("earlier", []), conditions]
+    return read_records(folder), was["commands"]

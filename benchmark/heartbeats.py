@@ -15,6 +15,8 @@ from benchmark.storages import patiently
 
 # Seconds between two heartbeats, and until a silent process is given up, by default
 BEAT, GRACE = 5.0, 60.0
+# Seconds between two looks after which the looker does not trust the silence, if the grace is short
+LONGEST_ABSENCE = 10.0
 
 # The attribute of a trial that changes while its process is alive
 PROGRESS = "progress"
@@ -103,6 +105,8 @@ class Silence:
     """
     Finds trials whose processes have fallen silent.
 
+    A looker that was away itself, as while the database was, counts from its return: the others had no way to be heard.
+
     :param grace: seconds of silence after which a process is taken for lost
     :param clock: tells seconds
     """
@@ -112,15 +116,19 @@ class Silence:
         self._clock = clock
         # By trial, the heartbeat that was seen last, and when it was first seen
         self._seen: dict[int, tuple[Any, float]] = {}
+        self._last_look: float | None = None
 
     def find(self, trials: Iterable[FrozenTrial]) -> list[FrozenTrial]:
         """
         Look at a study's trials.
 
         :param trials: the trials
-        :return: those that run, and whose heartbeat has stood still since a look that is long ago
+        :return: those that run, and whose heartbeat has stood still in all looks for longer than the grace
         """
         now = self._clock()
+        if self._last_look is not None and now - self._last_look > max(self._grace / 2, LONGEST_ABSENCE):
+            self._seen = {}
+        self._last_look = now
         silent = []
         for trial in trials:
             if trial.state is TrialState.RUNNING:

@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import pandas as pd
 
@@ -25,7 +26,7 @@ INTRODUCTION = f"""\
 # Results of sweeps
 
 A run's score is the mean return of its final model's own evaluation. {FAILURE_RULE} Figures and tables draw on their own
-study's runs, the claims on all of this page.
+study's runs, the claims on those of all studies here; what acting costs was measured apart, by `python -m benchmark.runtime`.
 
 Intervals are 95 % percentile bootstraps by rliable; runs are drawn within each task and configuration. Few runs make them
 too narrow: on normally distributed rewards, the interval of an interquartile mean of 2, 3, 4, 5, 10 runs holds the truth in
@@ -74,12 +75,7 @@ def study_section(study: Study, pictures: Sequence[Picture], command: str, repet
         progress(study),
         f"{facts['settings_in_words']}\n\nSeeds {', '.join(map(str, facts['seeds']))}; {facts['steps']:,} steps, evaluated "
         f"every {facts['evaluation_interval']:,} by {facts['evaluation_episodes']} episodes.",
-        f"The runs: {conditions_in_words(facts)}",
-        # Of a study that was gone on with
-        *(
-            f"{facts['runs_adopted']} of these runs were trained before: {conditions_in_words(earlier)}"
-            for earlier in facts.get("earlier", [])
-        ),
+        *commands_in_words(facts["commands"]),
     ]
     if study.records:
         parts += [picture.in_words(command) for picture in pictures]
@@ -88,6 +84,20 @@ def study_section(study: Study, pictures: Sequence[Picture], command: str, repet
         if improvement:
             parts += [f"### How often {OURS} improves", improvement]
     return "\n\n".join(parts)
+
+
+def commands_in_words(commands: Sequence[dict[str, Any]]) -> list[str]:
+    """
+    Say what trained a study's runs.
+
+    :param commands: the commands, from the first to the last
+    :return: a paragraph for each, in Markdown
+    """
+    if len(commands) == 1:
+        return [f"The runs: {conditions_in_words(commands[0])}"]
+    return [
+        f"From the time when {command['runs_ended']} runs had ended: {conditions_in_words(command)}" for command in commands
+    ]
 
 
 def progress(study: Study) -> str:

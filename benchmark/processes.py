@@ -40,7 +40,21 @@ def add_heartbeats(parser: argparse.ArgumentParser) -> None:
     :param parser: the command's parser
     """
     parser.add_argument("--beat", type=float, default=BEAT, help="seconds between two heartbeats (default: %(default)s)")
-    parser.add_argument("--grace", type=float, default=GRACE, help="seconds until a silent process is given up")
+    parser.add_argument(
+        "--grace", type=float, default=GRACE, help="seconds until a silent process is given up (default: %(default)s)"
+    )
+
+
+def see_that_grace_is_longer(beat: float, grace: float) -> None:
+    """
+    See that a living process is not taken for a silent one.
+
+    :param beat: seconds between two heartbeats
+    :param grace: seconds until a silent process is given up
+    :raises ValueError: if the grace is no longer than two heartbeats
+    """
+    if not 0 < 2 * beat < grace:
+        raise ValueError(f"The value of `grace` is {grace}, but must be more than two heartbeats of {beat} seconds")
 
 
 def share_of_cores(n_workers: int) -> int:

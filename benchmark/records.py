@@ -12,6 +12,30 @@ from sb3_cgp.files import write_atomically
 RUNS = "runs.jsonl"
 
 
+def configuration_in_words(method: str, settings: dict[str, Any]) -> str:
+    """
+    Name a configuration.
+
+    :param method: the method
+    :param settings: the values of the axes, by axis
+    :return: the name
+    """
+    return ",".join([method, *(f"{axis}={value}" for axis, value in sorted(settings.items()))])
+
+
+def run_key(method: str, settings: dict[str, Any], task: str, seed: int) -> str:
+    """
+    Name a run as no other run of its study is named.
+
+    :param method: the method
+    :param settings: the values of the axes, by axis
+    :param task: the environment
+    :param seed: the seed
+    :return: the name
+    """
+    return f"{configuration_in_words(method, settings)},{task},seed={seed}"
+
+
 @dataclass(frozen=True)
 class Record:
     """
@@ -41,6 +65,11 @@ class Record:
     final: float | None
     error: str | None
     seconds: float | None
+
+    @property
+    def key(self) -> str:
+        """What tells the run from all others of its study."""
+        return run_key(self.method, self.settings, self.task, self.seed)
 
 
 def write_records(folder: Path, records: Iterable[Record]) -> None:

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch as th
 import yaml
+from gymnasium.error import DependencyNotInstalled
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -23,14 +25,17 @@ from stable_baselines3.common.vec_env import sync_envs_normalization
 from benchmark.experiments import FINAL_EPISODES, Run
 from benchmark.random_actions import register_random_actions
 from benchmark.report import EVALUATION_SEED
+from benchmark.storages import STORAGE_ERRORS
 from sb3_cgp.files import write_atomically
 from sb3_cgp.resumable import resumable
 from sb3_cgp.resume import ResumedExperiment
-from sb3_cgp.store import StateStore
+from sb3_cgp.store import NoStateLeftError, StateStore
 from sb3_cgp.zoo import register, state_folder
 
 # What a run's states belong to, in its folder
 SETTINGS = "run.json"
+# What is no fault of a run's: the database, the disk, a package that is missing, too little memory
+MACHINE_ERRORS = (*STORAGE_ERRORS, OSError, ImportError, DependencyNotInstalled, MemoryError, th.OutOfMemoryError)
 # Takes environment steps and the mean return of an evaluation
 Report = Callable[[int, float], None]
 
@@ -63,9 +68,12 @@ def train(run: Run, folder: Path, report: Report, watch: Callable[[int], None], 
     register()
     register_random_actions()
     _begin(run, folder)
-    set_random_seed(run.seed)
-    manager = _manager(run, folder, device)
-    model, _ = manager.setup_experiment()  # type: ignore[misc]
+    try:
+        manager, model = _set_up(run, folder, device)
+    except NoStateLeftError as error:
+        print(f"{run.key} begins anew: {error}", flush=True)
+        forget_states(folder)
+        manager, model = _set_up(run, folder, device)
     (evaluation,) = (each for each in manager.callbacks if isinstance(each, EvalCallback))
     manager.callbacks.append(_Reporter(evaluation, report, watch))
     manager.learn(model)
@@ -92,6 +100,13 @@ def _begin(run: Run, folder: Path) -> None:
     if not path.is_file() or path.read_bytes() != settings:
         forget_states(folder)
         write_atomically(path, settings)
+
+
+def _set_up(run: Run, folder: Path, device: str) -> tuple[ExperimentManager, BaseAlgorithm]:
+    set_random_seed(run.seed)
+    manager = _manager(run, folder, device)
+    model, _ = manager.setup_experiment()  # type: ignore[misc]
+    return manager, model
 
 
 def _manager(run: Run, folder: Path, device: str) -> ExperimentManager:
@@ -131,7 +146,9 @@ def _hyperparams(run: Run) -> dict[str, Any]:
     hyperparams: dict[str, Any] = {"n_timesteps": run.steps, **run.hyperparams}
     if issubclass(ALGOS[run.algo], OffPolicyAlgorithm):
         saving = {"sb3_cgp.callbacks.TrainingCheckpointCallback": {"save_freq": run.checkpoint_interval, "keep": 1}}
-        hyperparams["callback"] = [saving]
+        # rl_zoo3 takes one callback, or a list of them
+        own = run.hyperparams.get("callback") or []
+        hyperparams["callback"] = [*(own if isinstance(own, list) else [own]), saving]
     return hyperparams
 
 

@@ -196,15 +196,26 @@ def score_table(studies: Sequence[Study]) -> pd.DataFrame:
     return table
 
 
-def curves(records: Sequence[Record], floor: float) -> tuple[np.ndarray, np.ndarray]:
+def evaluation_grid(records: Iterable[Record], task: str) -> np.ndarray:
+    """
+    List when a task's runs were evaluated.
+
+    :param records: the runs
+    :param task: the task
+    :return: environment steps (E) of all evaluations; none if every run failed before its first
+    """
+    return np.unique([step for record in records if record.task == task for step in record.timesteps]).astype(float)
+
+
+def curves(records: Sequence[Record], floor: float, grid: np.ndarray) -> np.ndarray:
     """
     Put learning curves side by side.
 
     :param records: the runs, at least one
     :param floor: what a failed run counts with
-    :return: environment steps (E) of all evaluations, and returns (N, E): a run's own, on straight lines between
+    :param grid: environment steps (E)
+    :return: returns (N, E): a run's own, on straight lines between
     """
-    grid = np.unique([timestep for record in records for timestep in record.timesteps]).astype(float)
     lines = np.full((len(records), len(grid)), floor)
     for line, record in zip(lines, records, strict=True):
         timesteps, returns = np.array(record.timesteps, dtype=float), np.array(record.returns, dtype=float)
@@ -213,4 +224,4 @@ def curves(records: Sequence[Record], floor: float) -> tuple[np.ndarray, np.ndar
             # A failed run has only what it reached
             shown = grid <= timesteps[known][-1] if failed(record) else np.ones(len(grid), dtype=bool)
             line[shown] = np.interp(grid[shown], timesteps[known], returns[known])
-    return grid, lines
+    return lines

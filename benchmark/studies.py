@@ -16,6 +16,7 @@ So no run is skipped and none counts twice, whichever processes die between whic
 serve databases alone, not its proxy.
 """
 
+import hashlib
 import json
 import time
 from collections import defaultdict
@@ -29,14 +30,14 @@ from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from benchmark.experiments import Run, Sweep, run_key
+from benchmark.experiments import Run, Sweep
 from benchmark.heartbeats import PROGRESS, Silence, TrialLostError, send_beat
 from benchmark.records import Record
 from benchmark.storages import patiently
 from benchmark.sweep_files import SweepError
 
-# Attributes of a study
-SWEEP = "sweep"
+# Attributes of a study: what it is, and the beginning of those that each tell of a command that worked on it
+SWEEP, COMMAND = "sweep", "command "
 # Attributes of a trial
 RUN, KEY, ERROR, WORKER, OUTCOME = "run", "key", "error", "worker", "outcome"
 
@@ -83,9 +84,9 @@ class Ledger:
         Make the study if it is not there, and enqueue what it lacks.
 
         :param sweep: the sweep
-        :param description: what is to be known of the sweep, as JSON has it
+        :param description: what is to be known of the sweep, as JSON has it; its "commands", if any, join those of before
         :param ended: runs that ended elsewhere, and need not be trained
-        :raises SweepError: if the study is there with runs of the same names and other settings
+        :raises SweepError: if the study is there with other settings
         """
         try:
             self._study_id = patiently(self.storage.create_new_study, [StudyDirection.MAXIMIZE], self.name)
@@ -94,9 +95,12 @@ class Ledger:
         runs, trials = sweep.runs(), self.trials()
         self._distributions = _distributions(sweep)
         self._check(runs, trials)
-        patiently(self.storage.set_study_user_attr, self.study_id, SWEEP, description)
+        commands = description.get("commands", [])
+        facts = {key: value for key, value in description.items() if key != "commands"}
+        patiently(self.storage.set_study_user_attr, self.study_id, SWEEP, facts)
         self.adopt(ended, runs)
         self.enqueue_missing(runs)
+        self._note(commands)
 
     def _check(self, runs: Sequence[Run], trials: Sequence[FrozenTrial]) -> None:
         # Optuna fixes what a study's parameters can be
@@ -114,6 +118,29 @@ class Ledger:
                     differing,
                     f"was {was.get(differing)!r} and is now {now[differing]!r} for {run.key}. Choose another name by --study",
                 )
+        for name in ("steps", "evaluation_interval", "evaluation_episodes") if trials else ():
+            before, after = trials[0].user_attrs[RUN][name], getattr(runs[0], name)
+            if before != after:
+                problem = f"was {before!r} and is now {after!r}. Choose another name by --study"
+                raise SweepError(f"The study {self.name!r}", name, problem)
+
+    def _note(self, commands: Iterable[dict[str, Any]]) -> None:
+        """
+        Note commands that train runs, each once, with the number of runs that had ended when it began.
+
+        Each is an attribute of its own, as several machines may begin at once.
+        """
+        if not self.left():
+            return
+        n_ended = sum(trial.state.is_finished() for trial in owned(self.trials()).values())
+        present = patiently(self.storage.get_study_user_attrs, self.study_id)
+        for command in commands:
+            # Started again, it is the same, whatever else the machine has to do
+            same = json.dumps({**command, "load_average": None, "runs_ended": None}, sort_keys=True)
+            digest = hashlib.sha256(same.encode()).hexdigest()[:16]
+            if not any(name.startswith(COMMAND) and name.endswith(digest) for name in present):
+                name, value = f"{COMMAND}{time.time_ns()} {digest}", {"runs_ended": n_ended, **command}
+                patiently(self.storage.set_study_user_attr, self.study_id, name, value)
 
     def trials(self) -> list[FrozenTrial]:
         """
@@ -128,9 +155,12 @@ class Ledger:
         """
         Read what is to be known of the sweep.
 
-        :return: what :meth:`open` was given
+        :return: what :meth:`open` was given, with all runs that it was ever given, and all commands
         """
-        return patiently(self.storage.get_study_user_attrs, self.study_id)[SWEEP]
+        attributes = patiently(self.storage.get_study_user_attrs, self.study_id)
+        noted = [(value["runs_ended"], name) for name, value in attributes.items() if name.startswith(COMMAND)]
+        commands = [attributes[name] for _, name in sorted(noted)]
+        return {**attributes[SWEEP], **_plan(self.trials()), "commands": commands}
 
     def enqueue_missing(self, runs: Iterable[Run], trials: Sequence[FrozenTrial] | None = None) -> None:
         """
@@ -153,19 +183,18 @@ class Ledger:
                 )
                 patiently(self.storage.create_new_trial, self.study_id, trial)
 
-    def adopt(self, records: Iterable[Record], runs: Sequence[Run]) -> int:
+    def adopt(self, records: Iterable[Record], runs: Sequence[Run]) -> None:
         """
-        Enter runs that ended elsewhere, as far as they are not in the study.
+        Enter runs that ended elsewhere, as far as the study has not begun them.
 
         :param records: their records
         :param runs: the runs of the sweep
-        :return: how many were entered
         """
         by_key = {run.key: run for run in runs}
-        owners, n_adopted = owned(self.trials()), 0
+        owners = owned(self.trials())
         for record in records:
-            key = run_key(record.method, record.settings, record.task, record.seed)
-            if key not in by_key or key in owners:
+            key, owner = record.key, owners.get(record.key)
+            if key not in by_key or (owner is not None and owner.state is not TrialState.WAITING):
                 continue
             attributes = {KEY: key, RUN: asdict(by_key[key]), PROGRESS: {"step": record.steps, "seconds": record.seconds}}
             trial = create_trial(
@@ -177,8 +206,9 @@ class Ledger:
                 intermediate_values=dict(zip(record.timesteps, record.returns, strict=True)),
             )
             patiently(self.storage.create_new_trial, self.study_id, trial)
-            n_adopted += 1
-        return n_adopted
+            # As long as it waits, or if a process takes it first, it is the run's
+            if owner is not None and self._take(self._id(owner)):
+                self._end(self._id(owner), TrialState.FAIL, outcome="given up: the run was adopted")
 
     def recover(self) -> None:
         """End the trials of processes that have fallen silent, and enqueue what is missing then."""
@@ -200,10 +230,7 @@ class Ledger:
             if trial.state is not TrialState.WAITING:
                 continue
             trial_id = self._id(trial)
-            try:
-                if not patiently(self.storage.set_trial_state_values, trial_id, TrialState.RUNNING):
-                    continue
-            except UpdateFinishedTrialError:
+            if not self._take(trial_id):
                 continue
             # None: this process was away for so long that it was given up meanwhile
             owner = owned(self.trials()).get(trial.user_attrs[KEY])
@@ -216,6 +243,12 @@ class Ledger:
                 continue
             return Claim(trial_id, Run(**trial.user_attrs[RUN]))
         return None
+
+    def _take(self, trial_id: int) -> bool:
+        try:
+            return patiently(self.storage.set_trial_state_values, trial_id, TrialState.RUNNING)
+        except UpdateFinishedTrialError:
+            return False
 
     def left(self) -> list[str]:
         """
@@ -347,6 +380,24 @@ def _seconds(trial: FrozenTrial) -> float:
 
 def _params(run: Run) -> dict[str, Any]:
     return {"method": run.method, "task": run.task, **run.settings, "seed": run.seed}
+
+
+def _plan(trials: Sequence[FrozenTrial]) -> dict[str, Any]:
+    """Say which runs trials are of, each in the order of the sweep's file."""
+    runs = {trial.user_attrs[KEY]: Run(**trial.user_attrs[RUN]) for trial in trials}
+
+    def in_order(name: str, present: set[str]) -> list[str]:
+        distribution = trials[0].distributions[name] if trials else None
+        choices = distribution.choices if isinstance(distribution, CategoricalDistribution) else ()
+        return [str(each) for each in choices if each in present]
+
+    return {
+        "methods": in_order("method", {run.method for run in runs.values()}),
+        "tasks": in_order("task", {run.task for run in runs.values()}),
+        "seeds": sorted({run.seed for run in runs.values()}),
+        "runs_planned": len(runs),
+        "configurations": {run.configuration: {"algo": run.algo, **run.hyperparams} for run in runs.values()},
+    }
 
 
 def _distributions(sweep: Sweep) -> dict[str, BaseDistribution]:

@@ -14,13 +14,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch as th
+from stable_baselines3.common.utils import get_device
 
 from benchmark.arguments import count, hyperparameter, output_folder
 from benchmark.experiments import Sweep, included_sweeps, load_sweep
-from benchmark.exports import ended_runs, export_study, without_places
+from benchmark.exports import ended_runs, export_study, see_that_none_is_lost, without_places
 from benchmark.figures import figures, study_folders
-from benchmark.processes import add_workers, share_of_cores, start_workers, stop, terminate
+from benchmark.processes import (
+    add_workers,
+    see_that_grace_is_longer,
+    share_of_cores,
+    start_workers,
+    stop,
+    terminate,
+)
 from benchmark.progress import Tally, display
 from benchmark.provenance import conditions
 from benchmark.storages import STORAGE_ERRORS, open_storage, reason_of
@@ -42,11 +49,9 @@ def describe(sweep: Sweep, argv: Sequence[str], device: str, threads: int = 1) -
     :return: plain data
     """
     file = sweep.file
-    circumstances = conditions(
-        "benchmark.sweep", without_places(argv), th.device("cpu") if device == "auto" else th.device(device)
-    )
+    command = conditions("benchmark.sweep", without_places(argv), get_device(device))
     # Not this process's, which trains nothing
-    circumstances["machine"]["torch_threads"] = threads
+    command["machine"]["torch_threads"] = threads
     return {
         "title": file.title,
         "experiment": sweep.name,
@@ -60,7 +65,7 @@ def describe(sweep: Sweep, argv: Sequence[str], device: str, threads: int = 1) -
         "settings_in_words": "; ".join(sweep.changes),
         "runs_planned": len(sweep.runs()),
         "configurations": {run.configuration: {"algo": run.algo, **run.hyperparams} for run in sweep.runs()},
-        **circumstances,
+        "commands": [command],
     }
 
 
@@ -90,16 +95,18 @@ def run(sweep: Sweep, study: str, args: argparse.Namespace, argv: Sequence[str])
     """
     ledger = Ledger(open_storage(args.storage), study, args.grace)
     description = describe(sweep, argv, args.device, args.threads)
-    ended, description["earlier"] = ended_runs(args.results / study, description) if args.adopt else ([], [])
-    description["runs_adopted"] = len(ended)
+    ended, earlier = ended_runs(args.results / study, description) if args.adopt else ([], [])
+    description["commands"] = [*earlier, *description["commands"]]
     ledger.open(sweep, description, ended)
+    see_that_none_is_lost(args.results / study, ledger)
     tally = Tally(sweep.file.steps)
     workers = start_workers(worker_command(args, study), args.workers, args.threads, args.logs / study)
     try:
         with display(study) as show:
             while True:
-                trials = ledger.trials()
-                show(tally.look(trials))
+                # Workers look for lost processes between their runs only
+                ledger.recover()
+                show(tally.look(ledger.trials()))
                 n_working = sum(worker.poll() is None for worker in workers)
                 if n_working == 0:
                     break
@@ -127,7 +134,10 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     :param argv: the arguments
     :return: what they say
     """
-    parser = argparse.ArgumentParser(prog="python -m benchmark.sweep", description="Run a sweep, or go on with it.")
+    # No abbreviations: what is not to be recorded is known by its name
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmark.sweep", description="Run a sweep, or go on with it.", allow_abbrev=False
+    )
     parser.add_argument("name", help="e1 to e8, the paper's, or the path of a sweep's file")
     parser.add_argument("--task", nargs="+", help="environments, in place of the file's")
     parser.add_argument("--steps", type=count, help="environment steps of each run, in place of the file's")
@@ -161,14 +171,11 @@ def load(name: str, args: argparse.Namespace) -> Sweep:
     :param args: the command line
     :return: the sweep
     """
-    interval = args.eval_interval
-    if interval is None and args.steps is not None:
-        interval = max(args.steps // 20, 1)
     overrides = dict(
         tasks=args.task,
         steps=args.steps,
         seeds=args.seeds,
-        evaluation_interval=interval,
+        evaluation_interval=args.eval_interval,
         evaluation_episodes=args.eval_episodes,
         hyperparams=dict(args.set) or None,
     )
@@ -198,6 +205,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parse(argv)
     signal.signal(signal.SIGTERM, terminate)
     try:
+        see_that_grace_is_longer(args.beat, args.grace)
         names = included_sweeps(args.name)
         sweeps = [load(name, args) for name in names]
         if args.study is not None and len(sweeps) > 1:

@@ -55,6 +55,19 @@ def known_task(name: str) -> str:
     return name
 
 
+def _with_numbers(hyperparams: Hyperparams) -> Hyperparams:
+    starts = hyperparams.get("learning_starts", 0)
+    if not isinstance(starts, int | float):
+        raise ValueError(f"`learning_starts` must be a number, and not {starts!r}")
+    return hyperparams
+
+
+def _all_different(values: list[Any]) -> list[Any]:
+    if len(set(values)) < len(values):
+        raise ValueError("must differ from each other")
+    return values
+
+
 class _Strict(BaseModel):
     """Data with no keys but those that are declared."""
 
@@ -71,7 +84,7 @@ class Method(_Strict):
     """
 
     algo: Annotated[str, AfterValidator(_known_algorithm)]
-    hyperparams: Hyperparams = {}
+    hyperparams: Annotated[Hyperparams, AfterValidator(_with_numbers)] = {}
     tuned: bool = False
 
 
@@ -94,8 +107,10 @@ class Axis(_Strict):
         if isinstance(self.values, dict):
             if self.sets is not None or self.sets_for:
                 raise ValueError("`sets` and `sets_for` are for a list of values: named values say what they set themselves")
-        elif len(set(map(repr, self.values))) < len(self.values):
-            raise ValueError("`values` must differ from each other")
+        elif len(set(map(str, self.values))) < len(self.values):
+            raise ValueError("`values` must differ from each other, also when they are written out")
+        for template in (self.sets or {}, *self.sets_for.values()):
+            _fill(template, None)
         return self
 
     def hyperparams(self, name: str, value: Any, method: str) -> Hyperparams:
@@ -110,13 +125,21 @@ class Axis(_Strict):
         if isinstance(self.values, dict):
             return self.values[value]
         sets = self.sets_for.get(method, self.sets if self.sets is not None else {name: "$value"})
-        return {key: _fill(template, value) for key, template in sets.items()}
+        return _fill(sets, value)
 
 
 def _fill(template: Any, value: Any) -> Any:
-    if template == "$value":
-        return value
-    return Template(template).substitute(value=value) if isinstance(template, str) else template
+    """Put a value in its places, also in those within lists and mappings."""
+    if isinstance(template, dict):
+        return {key: _fill(each, value) for key, each in template.items()}
+    if isinstance(template, list):
+        return [_fill(each, value) for each in template]
+    if template == "$value" or not isinstance(template, str):
+        return value if template == "$value" else template
+    try:
+        return Template(template).substitute(value=value)
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"`sets` has {template!r}, but only $value stands for something ($$ is a dollar sign)") from error
 
 
 class SweepFile(_Strict):
@@ -139,9 +162,12 @@ class SweepFile(_Strict):
 
     title: str
     methods: Annotated[list[str], Field(min_length=1)] | Annotated[dict[str, Method], Field(min_length=1)]
-    tasks: Annotated[list[Annotated[str, AfterValidator(known_task)]], Field(min_length=1)]
+    tasks: Annotated[list[Annotated[str, AfterValidator(known_task)]], Field(min_length=1), AfterValidator(_all_different)]
     steps: PositiveInt
-    seeds: PositiveInt | Annotated[list[Annotated[int, Field(ge=0, lt=2**32)]], Field(min_length=1)]
+    seeds: (
+        PositiveInt
+        | Annotated[list[Annotated[int, Field(ge=0, lt=2**32)]], Field(min_length=1), AfterValidator(_all_different)]
+    )
     evaluation_interval: PositiveInt
     evaluation_episodes: PositiveInt = 10
     checkpoint_interval: PositiveInt | None = None
@@ -151,6 +177,8 @@ class SweepFile(_Strict):
 
     @model_validator(mode="after")
     def _check(self) -> "SweepFile":
+        if self.evaluation_interval > self.steps:
+            raise ValueError(f"`evaluation_interval` is {self.evaluation_interval}, but must be at most `steps`, {self.steps}")
         for name, axis in self.axes.items():
             for method in axis.sets_for:
                 if method not in self.methods:

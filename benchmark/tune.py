@@ -20,7 +20,16 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
 from benchmark.arguments import count, hyperparameter
 from benchmark.entries import base_entry, write_entry
-from benchmark.processes import TERMINATED, add_workers, listen, share_of_cores, start_workers, stop, terminate
+from benchmark.processes import (
+    TERMINATED,
+    add_workers,
+    listen,
+    see_that_grace_is_longer,
+    share_of_cores,
+    start_workers,
+    stop,
+    terminate,
+)
 from benchmark.storages import STORAGE_ERRORS, open_storage, patiently, reason_of
 from benchmark.studies import ERROR
 from benchmark.sweep_files import SweepError, known_task
@@ -99,6 +108,8 @@ def conduct(tuner: Tuner, study: str, args: argparse.Namespace, argv: Sequence[s
             workers = start_workers(command, args.workers, args.threads, args.logs / study)
         told = ""
         while any(worker.poll() is None for worker in workers):
+            # Workers look for lost processes between their configurations only
+            tuner.recover()
             standing = describe(tuner.trials(), args.trials)
             if standing != told:
                 print(f"{study}: {standing}", file=sys.stderr, flush=True)
@@ -143,7 +154,9 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     :return: what they say
     """
     register()
-    parser = argparse.ArgumentParser(prog="python -m benchmark.tune", description="Tune hyperparameters by several seeds.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmark.tune", description="Tune hyperparameters by several seeds.", allow_abbrev=False
+    )
     parser.add_argument("--algo", required=True, choices=sorted(HYPERPARAMS_SAMPLER), help="the algorithm, as in rl_zoo3")
     parser.add_argument("--env", required=True, help="the environment")
     parser.add_argument("--steps", type=count, help="environment steps of each run (default: the YAML entry's)")
@@ -185,6 +198,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = args.study or f"tune-{args.algo}-{args.env}"
     try:
+        see_that_grace_is_longer(args.beat, args.grace)
         tuning = tuning_of(args)
         storage = open_storage(args.storage) if args.parent is None else patiently(open_storage, args.storage)
         tuner = Tuner(storage, study, tuning, args.grace)

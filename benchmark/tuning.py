@@ -18,7 +18,7 @@ import optuna
 from filelock import FileLock
 from gymnasium import spaces
 from optuna.exceptions import UpdateFinishedTrialError
-from optuna.pruners import BasePruner, MedianPruner, NopPruner, WilcoxonPruner
+from optuna.pruners import BasePruner, NopPruner, WilcoxonPruner
 from optuna.samplers import TPESampler
 from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState
@@ -28,8 +28,8 @@ from scipy.stats import trim_mean
 from benchmark.entries import sampled_entry
 from benchmark.experiments import Run
 from benchmark.heartbeats import Heart, Silence, TrialLostError, send_beat
-from benchmark.run import forget_states, run_folder, train
-from benchmark.storages import STORAGE_ERRORS, patiently
+from benchmark.run import MACHINE_ERRORS, forget_states, run_folder, train
+from benchmark.storages import patiently
 from benchmark.studies import ERROR, OUTCOME
 from benchmark.sweep_files import Hyperparams, SweepError
 
@@ -46,8 +46,29 @@ SCORING: dict[str, Callable[[Sequence[float]], float]] = {
     "iqm": lambda scores: float(trim_mean(scores, 0.25)),
     "min": min,
 }
+
+
+class ScorePruner(BasePruner):
+    """Gives up what scores less than complete trials' median after as many seeds. Optuna's compares its best score so far."""
+
+    def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
+        """
+        Compare a trial's last score.
+
+        :param study: the study
+        :param trial: the trial
+        :return: whether it is to be given up
+        """
+        step = trial.last_step
+        complete = patiently(study.get_trials, deepcopy=False, states=(TrialState.COMPLETE,))
+        others = [each.intermediate_values[step] for each in complete if step in each.intermediate_values]
+        if step is None or len(others) < N_STARTUP_TRIALS:
+            return False
+        return trial.intermediate_values[step] < float(np.median(others))
+
+
 PRUNERS: dict[str, Callable[[], BasePruner]] = {
-    "median": lambda: MedianPruner(n_startup_trials=N_STARTUP_TRIALS),
+    "median": ScorePruner,
     "wilcoxon": lambda: WilcoxonPruner(p_threshold=0.1),
     "none": NopPruner,
 }
@@ -190,9 +211,11 @@ class Tuner:
         except UpdateFinishedTrialError:
             return
         trial = patiently(self._storage.get_trial, trial_id)
-        if trial.params and ERROR not in trial.user_attrs:
+        # Of a configuration that was enqueued, some parameters may not have been suggested again yet
+        params = {**trial.system_attrs.get("fixed_params", {}), **trial.params}
+        if params and ERROR not in trial.user_attrs:
             attributes = {ORIGIN: trial.user_attrs.get(ORIGIN, trial.number), SCORES: trial.user_attrs.get(SCORES, [])}
-            patiently(self._study.enqueue_trial, trial.params, attributes)
+            patiently(self._study.enqueue_trial, params, attributes)
 
     def _id(self, number: int) -> int:
         return patiently(self._storage.get_trial_id_from_study_id_trial_number, self._study_id, number)
@@ -221,8 +244,7 @@ class Tuner:
             patiently(self._study.tell, trial, value, state, skip_if_finished=True)
         except (TrialLostError, UpdateFinishedTrialError):
             print(f"Trial {trial.number} was given up by another process", flush=True)
-        except (*STORAGE_ERRORS, OSError):
-            # The database or the disk, and no fault of the configuration's
+        except MACHINE_ERRORS:
             self._give_back(trial.number, STOPPED)
             raise
         except Exception as error:

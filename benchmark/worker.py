@@ -20,9 +20,9 @@ from filelock import FileLock
 
 from benchmark.arguments import count
 from benchmark.heartbeats import BEAT, Heart, TrialLostError
-from benchmark.processes import TERMINATED, add_heartbeats, listen
-from benchmark.run import forget_states, run_folder, train
-from benchmark.storages import STORAGE_ERRORS, open_storage, patiently
+from benchmark.processes import TERMINATED, add_heartbeats, listen, see_that_grace_is_longer
+from benchmark.run import MACHINE_ERRORS, forget_states, run_folder, train
+from benchmark.storages import open_storage, patiently
 from benchmark.studies import Claim, Ledger
 
 # Seconds between two looks at a study of which no run waits
@@ -71,8 +71,7 @@ def _train_claimed(ledger: Ledger, claim: Claim, logs: Path, beat: float, parent
         forget_states(folder)
     except TrialLostError:
         print(f"{claim.run.key} was taken over by another process", flush=True)
-    except (*STORAGE_ERRORS, OSError):
-        # The database or the disk, and no fault of the run's
+    except MACHINE_ERRORS:
         ledger.release(claim)
         raise
     except Exception as error:
@@ -108,6 +107,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     :param argv: the command line; None for the process's own
     """
     args = parse(sys.argv[1:] if argv is None else argv)
+    see_that_grace_is_longer(args.beat, args.grace)
     listen(args.parent)
     th.set_num_threads(args.threads)
     arguments: dict[str, Any] = dict(beat=args.beat, parent=args.parent, device=args.device)

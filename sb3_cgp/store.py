@@ -43,6 +43,10 @@ class DamagedStateError(ValueError):
         super().__init__(f"{path}: {reason}")
 
 
+class NoStateLeftError(ValueError):
+    """All states of a folder are damaged."""
+
+
 class StateStore:
     """
     The states of one training.
@@ -106,7 +110,7 @@ class StateStore:
 
         :return: its step, and the state
         :raises FileNotFoundError: if there is no state
-        :raises ValueError: if all are damaged, naming their files
+        :raises NoStateLeftError: if all are damaged, naming their files
         """
         damaged: list[str] = []
         for step in reversed(self.steps()):
@@ -120,7 +124,7 @@ class StateStore:
                 warnings.warn(f"Damaged: {'; '.join(damaged)}. The older state of step {step} is used.", stacklevel=2)
             return step, state
         if damaged:
-            raise ValueError(f"No state in {self.folder} is undamaged: {'; '.join(damaged)}.")
+            raise NoStateLeftError(f"No state in {self.folder} is undamaged: {'; '.join(damaged)}.")
         raise FileNotFoundError(f"There is no training state in {self.folder}.")
 
     def _manifest(self, step: int) -> Path:

@@ -66,7 +66,7 @@ def write_study(folder: Path, records: list[Record], planned: int | None = None)
         "evaluation_episodes": 5,
         "settings_in_words": "Hidden width 64.",
         "runs_planned": len(records) if planned is None else planned,
-        **conditions(SWEEP, [folder.name], th.device("cpu")),
+        "commands": [{"runs_ended": 0, **conditions(SWEEP, [folder.name], th.device("cpu"))}],
     }
     write_records(folder, records)
     (folder / "study.json").write_text(json.dumps(facts))

@@ -158,9 +158,14 @@ class Crew:
                 member.next_fault = Killed, takes_effect
             elif chance < 0.1:
                 member.next_fault = ConnectionError, takes_effect
-            elif chance < 0.12:
+            elif chance < 0.13:
                 # All but this one are away for long
-                self.clock.sleep(GRACE)
+                for _ in range(round(GRACE)):
+                    self.clock.sleep(2)
+                    member.step()
+                    if not member.is_alive:
+                        break
+                continue
             self.clock.sleep(self.draw.uniform(0, 2))
             member.step()
         raise AssertionError("it does not come to its end")

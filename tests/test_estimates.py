@@ -19,7 +19,7 @@ from benchmark.estimates import (
     share_reaching,
 )
 from benchmark.records import Record
-from benchmark.scores import Study, curves, floors, read_study, score_table, settings_in_words
+from benchmark.scores import Study, curves, evaluation_grid, floors, read_study, score_table, settings_in_words
 
 
 def study(folder: Path, records: list[Record], name: str = "sweep") -> Study:
@@ -59,7 +59,8 @@ def test_runs_of_different_length_on_one_task_are_kept_apart(tmp_path: Path) -> 
 
 def test_curve_of_a_failed_run_goes_on_at_the_floor() -> None:
     records = [record("TD3", 0, 8.0, returns=[1.0, 2.0, 4.0, 8.0]), record("TD3", 1, None, returns=[3.0, 5.0])]
-    grid, lines = curves(records, floors(records)["Pendulum-v1"])
+    grid = evaluation_grid(records, "Pendulum-v1")
+    lines = curves(records, floors(records)["Pendulum-v1"], grid)
     assert grid.tolist() == [250, 500, 750, 1_000]
     assert lines.tolist() == [[1.0, 2.0, 4.0, 8.0], [3.0, 5.0, 1.0, 1.0]]
 

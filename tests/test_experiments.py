@@ -90,6 +90,20 @@ def test_named_values_set_several_hyperparameters():
     assert (by_name["episode",]["train_freq"], by_name["episode",]["gradient_steps"]) == ([1, "episode"], -1)
 
 
+def test_a_value_is_put_in_all_its_places(sweep_of):
+    sets = {"policy_kwargs": {"net_arch": ["$value", 8]}, "train_freq": ["$value", "step"], "tau": 0.1}
+    sweep = sweep_of(axes={"width": {"values": [4], "sets": sets}}, seeds=1)
+    for run in sweep.runs():
+        assert run.hyperparams["policy_kwargs"] == {"net_arch": [4, 8]}
+        assert (run.hyperparams["train_freq"], run.hyperparams["tau"]) == ([4, "step"], 0.1)
+
+
+def test_a_mistake_in_the_file_of_methods_is_said_to_be_there(tmp_path, sweep_of):
+    (tmp_path / "methods.yml").write_text("TD3: {algo: td3, hyperparams: {gama: 1}}")
+    with pytest.raises(SweepError, match=r"methods\.yml: gama: no hyperparameter of TD3"):
+        sweep_of(methods=["TD3"])
+
+
 def test_later_settings_go_before_earlier_ones(tmp_path, sweep_of):
     sweep_of(hyperparams={"gamma": 0.9, "batch_size": 7}, axes={"batch_size": {"values": [8, 16]}})
     sweep = load_sweep(str(tmp_path / "mine.yml"), {"hyperparams": {"gamma": 0.5, "tau": 0.1}, "seeds": 1}, ["TD3"])
@@ -146,6 +160,17 @@ def test_a_subset_of_seeds_and_a_checkpoint_interval(sweep_of):
         (dict(methods={"A": {"algo": "td4"}}), "methods.A", "must be one of a2c"),
         (dict(axes={"gamma": {"values": []}}), "axes.gamma.values", "at least 1"),
         (dict(axes={"gamma": {"values": [0.5, 0.5]}}), "axes.gamma", "differ"),
+        (dict(axes={"gamma": {"values": [0.5, "0.5"]}}), "axes.gamma", "differ"),
+        (
+            dict(axes={"gamma": {"values": [1], "sets": {"gamma": ["$width"]}}}),
+            "axes.gamma",
+            "only $value stands for something",
+        ),
+        (dict(seeds=[1, 1]), "seeds", "must differ"),
+        (dict(tasks=["Pendulum-v1"] * 2), "tasks", "must differ"),
+        (dict(evaluation_interval=101), "evaluation_interval", "at most `steps`, 100"),
+        (dict(hyperparams={"n_timesteps": 50}), "n_timesteps", "must be one of"),
+        (dict(methods={"A": {"algo": "td3", "hyperparams": {"learning_starts": "1e2"}}}), "methods.A", "must be a number"),
         (dict(axes={"gamma": {"values": {"a": {}}, "sets": {}}}), "axes.gamma", "for a list of values"),
         (dict(axes={"x": {"values": [1], "sets_for": {"SAC": {}}}}), "SAC", "one of ['TD3', 'CGP-Online']"),
         (dict(exclude=[{"gamma": 1}]), "gamma", "must name one of"),

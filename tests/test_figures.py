@@ -16,7 +16,7 @@ from benchmark import figures as command
 from benchmark.drawing import stability
 from benchmark.figures import figures, main, study_folders
 from benchmark.page import reward_tables
-from benchmark.scores import read_study, score_table
+from benchmark.scores import curves, evaluation_grid, read_study, score_table
 from benchmark.style import FURTHER, METHODS, styles
 
 GRID = [{"learning_rate": rate, "batch_size": size} for rate in (0.01, 0.001) for size in (64, 32)]
@@ -108,6 +108,17 @@ def test_single_seed_and_a_study_without_runs(tmp_path: Path) -> None:
     assert "-150 (no interval)" in text.replace("-150.0", "-150")
     assert "0 of 8 planned runs have ended" in text
     assert "**supported**" not in text.replace("inference cost is independent of the CEM iterations | **supported**", "")
+
+
+def test_a_method_whose_runs_all_failed_before_an_evaluation(tmp_path: Path) -> None:
+    records = [record("PPO", seed, None, returns=[]) for seed in range(2)]
+    alone = figures([write_study(tmp_path / "alone", records)], tmp_path, repetitions=20).read_text()
+    assert "2 of 2 planned runs have ended, 2 of them failed." in alone
+    # On the axis of those who got further, at the floor
+    study = read_study(write_study(tmp_path / "beside", records + runs(score, ["TD3"], seeds=range(2))))
+    grid = evaluation_grid(study.records, "Pendulum-v1")
+    assert curves(records, -7.0, grid).tolist() == [[-7.0] * 4] * 2
+    assert "| Pendulum-v1 | PPO |" in figures([study.folder], tmp_path, repetitions=20).read_text()
 
 
 def test_settings_stand_in_the_order_of_the_axes(tmp_path: Path) -> None:

@@ -9,6 +9,8 @@ import sys
 import time
 
 import pytest
+import torch as th
+from gymnasium.error import DependencyNotInstalled
 from optuna.exceptions import StorageInternalError
 from optuna.storages import InMemoryStorage, RDBStorage
 from optuna.trial import TrialState
@@ -44,6 +46,14 @@ def open_ledger(storage, clock, **sweep):
 def another(ledger, clock=None):
     """A ledger of another process."""
     return Ledger(ledger.storage, ledger.name, GRACE, clock or ledger._silence._clock)
+
+
+def look_for(ledger, seconds):
+    """Let a process look again and again, and the time pass."""
+    for _ in range(round(seconds / 5)):
+        ledger.recover()
+        ledger._silence._clock.sleep(5)
+    ledger.recover()
 
 
 def trials_of(storage):
@@ -120,13 +130,10 @@ def test_a_silent_process_is_given_up_after_the_grace(ledger):
     claim = ledger.claim("silent")
     ledger.beat(claim, "1-0", 10, 1.0)
     other = another(ledger)
-    other.recover()
-    clock.sleep(GRACE)
+    look_for(other, GRACE)
     ledger.beat(claim, "1-1", 20, 2.0)
-    other.recover()
-    clock.sleep(GRACE)
-    # The beat was seen just before: its silence has lasted for the grace, and not for longer
-    other.recover()
+    look_for(other, GRACE)
+    # Its silence has lasted for the grace, and not for longer
     assert ledger.trials()[0].state is TrialState.RUNNING
     clock.sleep(1)
     other.recover()
@@ -138,34 +145,39 @@ def test_a_silent_process_is_given_up_after_the_grace(ledger):
     assert len(ledger.trials()) == 4
 
 
+def test_who_was_away_gives_nobody_up(ledger):
+    """While the database was away, nobody could be heard."""
+    claim = ledger.claim("alive")
+    ledger.beat(claim, "1-0", 10, 1.0)
+    other = another(ledger)
+    look_for(other, 10)
+    for _ in range(3):
+        other._silence._clock.sleep(2 * GRACE)
+        other.recover()
+        assert ledger.trials()[0].state is TrialState.RUNNING
+    look_for(other, GRACE + 5)
+    assert ledger.trials()[0].state is TrialState.FAIL
+
+
 def test_a_process_that_never_beat_is_given_up(ledger):
     ledger.claim("stillborn")
-    ledger.recover()
-    ledger._silence._clock.sleep(GRACE + 1)
-    ledger.recover()
+    look_for(ledger, GRACE + 5)
     assert ledger.trials()[0].state is TrialState.FAIL
 
 
 def test_a_run_that_is_lost_again_and_again_has_one_open_trial(ledger):
-    clock = ledger._silence._clock
     key = ledger.trials()[0].user_attrs[KEY]
     for _ in range(5):
         while (claim := ledger.claim("mortal")) is not None and claim.run.key != key:
             ledger.complete(claim, 0.0)
-        ledger.recover()
-        clock.sleep(GRACE + 1)
-        ledger.recover()
+        look_for(ledger, GRACE + 5)
         own = [trial for trial in ledger.trials() if trial.user_attrs[KEY] == key]
         assert [trial.state for trial in own if trial.state is not TrialState.FAIL] == [TrialState.WAITING]
 
 
 def test_a_process_that_comes_back_has_lost_its_trial(ledger):
-    clock = ledger._silence._clock
     claim = ledger.claim("paused")
-    other = another(ledger)
-    other.recover()
-    clock.sleep(GRACE + 1)
-    other.recover()
+    look_for(another(ledger), GRACE + 5)
     with pytest.raises(TrialLostError, match="trial 0"):
         ledger.beat(claim, "1-0", 0, 0.0)
     with pytest.raises(TrialLostError):
@@ -198,9 +210,7 @@ def test_a_failure_is_recorded_with_its_error_and_its_curve(ledger):
 def test_a_failure_stands_although_its_process_died_before_it_ended_the_trial(ledger):
     claim = ledger.claim("one")
     ledger.storage.set_trial_user_attr(claim.trial_id, ERROR, "ValueError: its own fault")
-    ledger.recover()
-    ledger._silence._clock.sleep(GRACE + 1)
-    ledger.recover()
+    look_for(ledger, GRACE + 5)
     assert [record.error for record in ledger.records()] == ["ValueError: its own fault"]
     assert len(ledger.trials()) == 3
 
@@ -260,9 +270,7 @@ def test_hyperparameters_that_json_changes_are_the_same(ledger):
 def test_trials_of_others_are_left_alone(ledger):
     ledger.storage.create_new_trial(ledger.study_id)
     assert len(ledger.trials()) == 3
-    ledger.recover()
-    ledger._silence._clock.sleep(GRACE + 1)
-    ledger.recover()
+    look_for(ledger, GRACE + 5)
     assert trials_of(ledger.storage)[-1].state is TrialState.RUNNING
 
 
@@ -310,6 +318,21 @@ def test_no_patience_with_other_errors(clock):
 def test_a_storage_that_is_none(url, message):
     with pytest.raises(ValueError, match=message):
         open_storage(url)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [OSError("disk"), ImportError("no Box2D"), DependencyNotInstalled("no Box2D"), MemoryError(), th.OutOfMemoryError("GPU")],
+)
+def test_what_the_machine_lacks_is_no_fault_of_the_run(ledger, monkeypatch, tmp_path, error):
+    def train(*args):
+        raise error
+
+    monkeypatch.setattr(worker, "train", train)
+    with pytest.raises(type(error)):
+        work(ledger, tmp_path, "a process")
+    assert ledger.records() == []
+    assert len(ledger.left()) == 3
 
 
 def test_processes_that_make_a_database_at_once(tmp_path):

@@ -50,7 +50,12 @@ def test_mistakes_end_the_command_with_what_is_allowed(tmp_path):
         (["e9"], "must be one of e1"),
         (["e3", "--task", "Pendulum-v7"], "Pendulum-v1"),
         (["e3", "--methods", "SAC"], "CGP-Online"),
-        (["e3", "--set", "gama=1"], "gamma"),
+        (
+            ["e3", "--set", "gama=1"],
+            "the command line: gama: no hyperparameter of CGP-Online (cgp), which must be one of gamma",
+        ),
+        (["e3", "--steps", "10", "--eval-interval", "11"], "must be at most `steps`, 10"),
+        (["e3", "--grace", "10"], "The value of `grace` is 10.0, but must be more than two heartbeats of 5.0 seconds"),
         (["e2", "--study", "mine"], "is 5 sweeps"),
         (["e3", "--storage", "nonsense"], "storage"),
         (["e3", "--storage", "grpc://localhost"], "port"),
@@ -65,18 +70,23 @@ def ledger(tmp_path):
     """A study that is enqueued, of two runs."""
     sweep, _ = of_command_line(*SMALL, "--results", str(tmp_path / "results"))
     ledger = Ledger(open_storage(f"sqlite:///{tmp_path}/studies.db"), "mine")
-    ledger.open(sweep, describe(sweep, SMALL, "cpu") | {"earlier": []})
+    ledger.open(sweep, describe(sweep, SMALL, "cpu"))
     return ledger
 
 
-def test_an_exported_study_is_adopted_by_another(tmp_path, ledger):
+def end_both(ledger):
+    """End the study's runs, one by an error, and list the records."""
     first = ledger.claim("w")
     ledger.beat(first, "1", 400, 12.0)
     for step, value in ((20, -5.0), (40, -4.0)):
         ledger.report(first, step, value)
     ledger.complete(first, -3.0)
-    second = ledger.claim("w")
-    ledger.fail(second, ValueError("a NaN"))
+    ledger.fail(ledger.claim("w"), ValueError("a NaN"))
+    return ledger.records()
+
+
+def test_an_exported_study_is_adopted_by_another(tmp_path, ledger):
+    end_both(ledger)
     folder = export_study("mine", f"sqlite:///{tmp_path}/studies.db", tmp_path / "results")
     records = read_records(folder)
     assert {record.error for record in records} == {None, "ValueError: a NaN"}
@@ -84,11 +94,12 @@ def test_an_exported_study_is_adopted_by_another(tmp_path, ledger):
     assert (done.timesteps, done.returns, done.final, done.seconds) == ([20, 40], [-5.0, -4.0], -3.0, 12.0)
 
     sweep, _ = of_command_line(*SMALL[:-4], "--seeds", "2", "--methods", "TD3", "--results", str(tmp_path / "results"))
-    description = describe(sweep, [], "cpu")
-    ended, earlier = ended_runs(folder, description)
-    assert earlier[0]["command"].startswith("python -m benchmark.sweep e8")
+    description = describe(sweep, ["mine"], "cpu")
+    ended, commands = ended_runs(folder, description)
     other = Ledger(open_storage(f"sqlite:///{tmp_path}/other.db"), "mine")
-    other.open(sweep, description | {"earlier": earlier}, ended)
+    other.open(sweep, description | {"commands": [*commands, *description["commands"]]}, ended)
+    told = [(command["command"], command["runs_ended"]) for command in other.description()["commands"]]
+    assert told == [(f"python -m benchmark.sweep {' '.join(SMALL)}", 0), ("python -m benchmark.sweep mine", 2)]
     assert sorted(map(str, other.records())) == sorted(map(str, records))
     waiting = [trial.user_attrs[KEY] for trial in other.trials() if trial.state is TrialState.WAITING]
     assert len(waiting) == 2
@@ -96,6 +107,54 @@ def test_an_exported_study_is_adopted_by_another(tmp_path, ledger):
     # Once
     other.open(sweep, description, ended)
     assert len(other.trials()) == 4
+
+
+def test_runs_that_wait_are_adopted_and_those_that_have_begun_are_not(tmp_path, ledger):
+    records = end_both(ledger)
+    sweep, _ = of_command_line(*SMALL, "--results", str(tmp_path))
+    other = Ledger(open_storage(f"sqlite:///{tmp_path}/other.db"), "mine")
+    other.open(sweep, describe(sweep, [], "cpu"))
+    begun = other.claim("w")
+    other.open(sweep, describe(sweep, [], "cpu"), records)
+    assert [record.key for record in other.records()] == [record.key for record in records if record.key != begun.run.key]
+    assert other.left() == [begun.run.key]
+    other.complete(begun, -1.0)
+    assert {record.key: record.final for record in other.records()} == {
+        record.key: -1.0 if record.key == begun.run.key else record.final for record in records
+    }
+    assert other.claim("w") is None
+
+
+@pytest.mark.parametrize("options", [[], ["--adopt", "--methods", "SAC"]])
+def test_exported_runs_are_not_overwritten_by_fewer(tmp_path, ledger, monkeypatch, options):
+    """... where the storage is gone, or the command is of other runs."""
+    end_both(ledger)
+    folder = export_study("mine", f"sqlite:///{tmp_path}/studies.db", tmp_path / "results")
+    before = (folder / "runs.jsonl").read_bytes()
+    monkeypatch.setattr("benchmark.sweep.start_workers", lambda *args: pytest.fail("it trains"))
+    places = ["--results", str(tmp_path / "results"), "--storage", f"sqlite:///{tmp_path}/new.db", "--study", "mine"]
+    with pytest.raises(SystemExit, match="has 2 ended runs that the study lacks, such as TD3,train_every=episode"):
+        main([*SMALL, *places, *options])
+    with pytest.raises(SweepError, match="has 2 ended runs that the study lacks"):
+        export_study("mine", f"sqlite:///{tmp_path}/new.db", tmp_path / "results")
+    assert (folder / "runs.jsonl").read_bytes() == before
+
+
+def test_a_study_says_all_that_it_was_ever_given(tmp_path, ledger):
+    more, _ = of_command_line(*SMALL[:-2], "--methods", "SAC", "CGP-Online", "--results", str(tmp_path))
+    ledger.open(more, describe(more, ["more"], "cpu"))
+    # Again, and of a study that has nothing left to train
+    ledger.open(more, describe(more, ["more"], "cpu"))
+    while (claim := ledger.claim("w")) is not None:
+        ledger.complete(claim, 1.0)
+    ledger.open(more, describe(more, ["idle"], "cpu"))
+    told = ledger.description()
+    assert (told["methods"], told["seeds"], told["runs_planned"]) == (["CGP-Online", "TD3", "SAC"], [0], 6)
+    assert len(told["configurations"]) == 6
+    assert [command["command"].split()[-1] for command in told["commands"]] == ["TD3", "more"]
+    shorter, _ = of_command_line(*SMALL[:-2], "--methods", "DDPG", "--steps", "300", "--results", str(tmp_path))
+    with pytest.raises(SweepError, match=r"steps: was 400 and is now 300.*--study"):
+        ledger.open(shorter, describe(shorter, [], "cpu"))
 
 
 def test_runs_of_other_settings_are_not_adopted(tmp_path, ledger):
@@ -110,7 +169,10 @@ def test_runs_of_other_settings_are_not_adopted(tmp_path, ledger):
 def test_where_databases_are_is_not_recorded():
     argv = ["e8", "--storage", "postgresql://me:secret@host/db", "--seeds", "1", "--logs=here", "--results", "there"]
     sweep, _ = of_command_line(*SMALL)
-    assert describe(sweep, argv, "cpu")["command"] == "python -m benchmark.sweep e8 --seeds 1"
+    assert describe(sweep, argv, "cpu")["commands"][0]["command"] == "python -m benchmark.sweep e8 --seeds 1"
+    with pytest.raises(SystemExit):
+        # An abbreviation would be recorded
+        parse(["e8", "--stor", "postgresql://me:secret@host/db"])
 
 
 def test_records_come_back(tmp_path):

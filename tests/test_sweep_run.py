@@ -149,6 +149,24 @@ def test_resumable_changes_nothing_else():
         np.testing.assert_array_equal(with_states.policy.state_dict()[name], value, err_msg=name)
 
 
+def test_a_run_whose_states_are_all_damaged_begins_anew(tmp_path, run_of):
+    run = run_of(**TINY)
+    straight = trained(run, tmp_path / "straight")
+    with pytest.raises(Interruption):
+        train(run, tmp_path / "stopped", lambda step, value: None, interrupt_at(300), "cpu")
+    (manifest,) = (tmp_path / "stopped" / "state").glob("state-*.json")
+    manifest.write_text("cut sh")
+    assert trained(run, tmp_path / "stopped") == straight
+
+
+def test_callbacks_of_ones_own_are_kept(tmp_path, run_of):
+    callback = {
+        "stable_baselines3.common.callbacks.CheckpointCallback": {"save_freq": 200, "save_path": str(tmp_path / "own")}
+    }
+    trained(run_of(**TINY, callback=callback), tmp_path / "run")
+    assert len(list((tmp_path / "own").glob("*.zip"))) == 2
+
+
 def test_a_run_is_not_taken_up_from_the_states_of_another(tmp_path, run_of):
     """... which a study of the same name has left, in a storage that is gone."""
     with pytest.raises(Interruption):

@@ -4,6 +4,7 @@ import argparse
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -158,6 +159,16 @@ def test_an_entry_is_replaced_and_nothing_else(tmp_path):
     assert path.read_text() == OTHERS.replace(old, "Pendulum-v1:\n  # tuned again\n  gamma: 0.6")
 
 
+def test_a_link_stays_one_and_lines_end_as_they_did(tmp_path):
+    (tmp_path / "real.yml").write_bytes(b"# Mine\r\nAnt-v5:\r\n  gamma: 0.9\r\n")
+    (tmp_path / "mine.yml").symlink_to("real.yml")
+    write_entry(tmp_path / "mine.yml", "Hopper-v5", {"gamma": 0.5}, "tuned")
+    assert (tmp_path / "mine.yml").is_symlink()
+    assert (tmp_path / "real.yml").read_bytes() == (
+        b"# Mine\r\nAnt-v5:\r\n  gamma: 0.9\r\nHopper-v5:\r\n  # tuned\r\n  gamma: 0.5\r\n"
+    )
+
+
 @pytest.mark.parametrize("before", [None, "", "# Nothing yet\n", OTHERS, OTHERS.rstrip("\n")])
 def test_an_entry_is_added(tmp_path, before):
     path = tmp_path / "folder" / "mine.yml"
@@ -234,6 +245,14 @@ def test_pruning_by_the_median_of_scores_so_far(work, pretend):
     assert tune.describe(trials, 8) == "8 of 8 configurations over (3 pruned, 0 failed), 0 running, best 1 (trial 0)"
 
 
+@pytest.mark.parametrize("score", ["mean", "min"])
+def test_a_good_first_seed_does_not_save_what_falls_behind(work, pretend, score):
+    pretend(lambda run: 0.0 if int(run.method.split("-")[1]) < 5 else 10.0 - 25.0 * run.seed)
+    trials = work("--score", score, trials=6, seeds=3)
+    assert [trial.state for trial in trials] == [TrialState.COMPLETE] * 5 + [TrialState.PRUNED]
+    assert list(trials[5].intermediate_values) == [0, 1]
+
+
 def test_pruning_by_wilcoxons_test_of_paired_seeds(work, pretend):
     """Seeds differ by more than configurations, as in life; paired, these are told apart."""
     runs = pretend(lambda run: 100.0 * run.seed - float(run.method.split("-")[1]) * (1 + 0.1 * run.seed))
@@ -271,6 +290,20 @@ def test_a_stopped_configuration_is_taken_up_where_it_was(work, pretend):
     assert runs == [("trial-0", 0), ("trial-0", 1), ("trial-0", 1)]
 
 
+def test_a_configuration_that_is_stopped_while_it_is_suggested_again_stays_whole(work, pretend, tmp_path):
+    storage = InMemoryStorage()
+    tuner = tuner_of(tune.parse(arguments("--logs", str(tmp_path))), storage)
+    (params,) = (params for _, params in list(samples("td3"))[:1])
+    tuner._study.enqueue_trial(params, {SCORES: [3.0], ORIGIN: 7})
+    trial = tuner._study.ask()
+    trial.suggest_float("one_minus_gamma", 0.0001, 0.03, log=True)
+    tuner._give_back(trial.number, "given back")
+    runs = pretend(lambda run: 1.0)
+    again = work(storage=storage, trials=1)[-1]
+    assert (again.state, again.params, again.user_attrs[SCORES]) == (TrialState.COMPLETE, params, [3.0, 1.0])
+    assert runs == [("trial-7", 1)]
+
+
 def test_a_lost_configuration_is_taken_up_by_another_process(work, pretend, tmp_path):
     storage = InMemoryStorage()
 
@@ -292,8 +325,9 @@ def test_a_lost_configuration_is_taken_up_by_another_process(work, pretend, tmp_
         patch.setattr(tuning, "train", die)
         with pytest.raises(Killed):
             dying.attempt(tmp_path, 5.0, None, "cpu")
-    other = tuner_of(args, storage, grace=0.0)
+    other = tuner_of(args, storage, grace=0.01)
     other.recover()
+    time.sleep(0.1)
     other.recover()
     assert [trial.state for trial in other.trials()] == [TrialState.FAIL, TrialState.WAITING]
     lost, again = work(storage=storage, trials=1)
