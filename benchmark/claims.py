@@ -151,7 +151,8 @@ def best_or_second(table: pd.DataFrame, repetitions: int) -> list[Part]:
             assert found is not None
             means = _each(runs, (OURS, *rivals), interquartile_mean)
             rank = 1 + sum(mean > means[0] for mean in means[1:])
-            text = f"rank {rank} of {len(means)} on {runs['task'].iloc[0]}, lead over the second best rival {found.in_words('.3f')}"
+            place = f"rank {rank} of {len(means)} on {runs['task'].iloc[0]}"
+            text = f"{place}, lead over the second best rival {found.in_words('.3f')}"
             parts.append(Part(text, judge(found, more_than=0)))
     return parts
 
