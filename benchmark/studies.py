@@ -131,7 +131,8 @@ class Ledger:
         Each is an attribute of its own, as several machines may begin at once.
         """
         if not self.left():
-            return
+            # What begins now has nothing to train; those of adopted runs have that number already
+            commands = [command for command in commands if "runs_ended" in command]
         n_ended = sum(trial.state.is_finished() for trial in owned(self.trials()).values())
         present = patiently(self.storage.get_study_user_attrs, self.study_id)
         for command in commands:
@@ -396,7 +397,10 @@ def _plan(trials: Sequence[FrozenTrial]) -> dict[str, Any]:
         "tasks": in_order("task", {run.task for run in runs.values()}),
         "seeds": sorted({run.seed for run in runs.values()}),
         "runs_planned": len(runs),
-        "configurations": {run.configuration: {"algo": run.algo, **run.hyperparams} for run in runs.values()},
+        "configurations": {
+            run.configuration: {"algo": run.algo, **run.hyperparams}
+            for run in sorted(runs.values(), key=lambda run: run.configuration)
+        },
     }
 
 

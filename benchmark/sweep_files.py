@@ -130,12 +130,14 @@ class Axis(_Strict):
 
 def _fill(template: Any, value: Any) -> Any:
     """Put a value in its places, also in those within lists and mappings."""
+    if template == "$value":
+        return value
     if isinstance(template, dict):
         return {key: _fill(each, value) for key, each in template.items()}
     if isinstance(template, list):
         return [_fill(each, value) for each in template]
-    if template == "$value" or not isinstance(template, str):
-        return value if template == "$value" else template
+    if not isinstance(template, str):
+        return template
     try:
         return Template(template).substitute(value=value)
     except (KeyError, ValueError) as error:

@@ -109,6 +109,15 @@ def test_an_exported_study_is_adopted_by_another(tmp_path, ledger):
     assert len(other.trials()) == 4
 
 
+def test_a_study_that_is_adopted_whole_still_says_what_trained_it(tmp_path, ledger):
+    end_both(ledger)
+    folder = export_study("mine", f"sqlite:///{tmp_path}/studies.db", tmp_path / "results")
+    before = (folder / "study.json").read_text()
+    again = ["--study", "mine", "--adopt", "--storage", f"sqlite:///{tmp_path}/other.db", "--logs", str(tmp_path / "logs")]
+    main([*SMALL, *again, "--results", str(tmp_path / "results")])
+    assert (folder / "study.json").read_text() == before
+
+
 def test_runs_that_wait_are_adopted_and_those_that_have_begun_are_not(tmp_path, ledger):
     records = end_both(ledger)
     sweep, _ = of_command_line(*SMALL, "--results", str(tmp_path))
