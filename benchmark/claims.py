@@ -349,15 +349,15 @@ def _fails(table: pd.DataFrame, axis: str, is_bad: pd.Series, repetitions: int) 
     for _, runs in ours.groupby(["study", "task"], sort=False):
         bad, others = runs[runs["is_bad"]], runs[~runs["is_bad"]]
         pairs = []
-        for value, good in others.groupby("value", sort=False):
+        for _, good in others.groupby("value", sort=False):
             # Where all else is equal
             both = set(bad["rest"]) & set(good["rest"])
             if both:
-                pairs.append((good[good["rest"].isin(both)], bad[bad["rest"].isin(both)], value))
+                pairs.append((good[good["rest"].isin(both)], bad[bad["rest"].isin(both)]))
         if pairs:
-            good, poor, value = max(pairs, key=lambda pair: pair[0]["share"].mean())
+            good, poor = max(pairs, key=lambda pair: pair[0]["share"].mean())
             groups += [cells_of(good, "share"), cells_of(poor, "share")]
-            good_values.append(str(value))
+            good_values += map(str, good["value"])
             bad_values += map(str, poor["value"])
     if not groups:
         return []

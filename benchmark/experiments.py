@@ -7,7 +7,7 @@ A file's keys are the fields of :class:`~benchmark.sweep_files.SweepFile`.
 import difflib
 import inspect
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -68,6 +68,26 @@ class Run:
     def key(self) -> str:
         """What tells the run from all others of its study."""
         return run_key(self.method, self.settings, self.task, self.seed)
+
+
+def overview(runs: Iterable[Run], methods: Iterable[str], tasks: Iterable[str]) -> dict[str, Any]:
+    """
+    Say what runs there are.
+
+    :param runs: the runs, some perhaps more than once
+    :param methods: all methods that they may be of, in order
+    :param tasks: all environments that they may be of, in order
+    :return: the methods, tasks and seeds that they are of, their number, and the hyperparameters of each configuration
+    """
+    by_key = {run.key: run for run in runs}
+    ordered = sorted(by_key.values(), key=lambda run: run.configuration)
+    return {
+        "methods": [method for method in methods if any(run.method == method for run in ordered)],
+        "tasks": [task for task in tasks if any(run.task == task for run in ordered)],
+        "seeds": sorted({run.seed for run in ordered}),
+        "runs_planned": len(ordered),
+        "configurations": {run.configuration: {"algo": run.algo, **run.hyperparams} for run in ordered},
+    }
 
 
 @dataclass(frozen=True)

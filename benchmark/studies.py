@@ -30,7 +30,7 @@ from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from benchmark.experiments import Run, Sweep
+from benchmark.experiments import Run, Sweep, overview
 from benchmark.heartbeats import PROGRESS, Silence, TrialLostError, send_beat
 from benchmark.records import Record
 from benchmark.storages import patiently
@@ -161,7 +161,10 @@ class Ledger:
         attributes = patiently(self.storage.get_study_user_attrs, self.study_id)
         noted = [(value["runs_ended"], name) for name, value in attributes.items() if name.startswith(COMMAND)]
         commands = [attributes[name] for _, name in sorted(noted)]
-        return {**attributes[SWEEP], **_plan(self.trials()), "commands": commands}
+        trials = self.trials()
+        runs = [Run(**trial.user_attrs[RUN]) for trial in trials]
+        given = overview(runs, _choices(trials, "method"), _choices(trials, "task"))
+        return {**attributes[SWEEP], **given, "commands": commands}
 
     def enqueue_missing(self, runs: Iterable[Run], trials: Sequence[FrozenTrial] | None = None) -> None:
         """
@@ -208,8 +211,8 @@ class Ledger:
             )
             patiently(self.storage.create_new_trial, self.study_id, trial)
             # As long as it waits, or if a process takes it first, it is the run's
-            if owner is not None and self._take(self._id(owner)):
-                self._end(self._id(owner), TrialState.FAIL, outcome="given up: the run was adopted")
+            if owner is not None and self._take(owner_id := self._id(owner)):
+                self._end(owner_id, TrialState.FAIL, outcome="given up: the run was adopted")
 
     def recover(self) -> None:
         """End the trials of processes that have fallen silent, and enqueue what is missing then."""
@@ -383,25 +386,9 @@ def _params(run: Run) -> dict[str, Any]:
     return {"method": run.method, "task": run.task, **run.settings, "seed": run.seed}
 
 
-def _plan(trials: Sequence[FrozenTrial]) -> dict[str, Any]:
-    """Say which runs trials are of, each in the order of the sweep's file."""
-    runs = {trial.user_attrs[KEY]: Run(**trial.user_attrs[RUN]) for trial in trials}
-
-    def in_order(name: str, present: set[str]) -> list[str]:
-        distribution = trials[0].distributions[name] if trials else None
-        choices = distribution.choices if isinstance(distribution, CategoricalDistribution) else ()
-        return [str(each) for each in choices if each in present]
-
-    return {
-        "methods": in_order("method", {run.method for run in runs.values()}),
-        "tasks": in_order("task", {run.task for run in runs.values()}),
-        "seeds": sorted({run.seed for run in runs.values()}),
-        "runs_planned": len(runs),
-        "configurations": {
-            run.configuration: {"algo": run.algo, **run.hyperparams}
-            for run in sorted(runs.values(), key=lambda run: run.configuration)
-        },
-    }
+def _choices(trials: Sequence[FrozenTrial], name: str) -> list[Any]:
+    distribution = trials[0].distributions[name] if trials else None
+    return list(distribution.choices) if isinstance(distribution, CategoricalDistribution) else []
 
 
 def _distributions(sweep: Sweep) -> dict[str, BaseDistribution]:

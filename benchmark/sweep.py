@@ -17,7 +17,7 @@ from typing import Any
 from stable_baselines3.common.utils import get_device
 
 from benchmark.arguments import count, hyperparameter, output_folder
-from benchmark.experiments import Sweep, included_sweeps, load_sweep
+from benchmark.experiments import Sweep, included_sweeps, load_sweep, overview
 from benchmark.exports import ended_runs, export_study, see_that_none_is_lost, without_places
 from benchmark.figures import figures, study_folders
 from benchmark.processes import (
@@ -56,15 +56,11 @@ def describe(sweep: Sweep, argv: Sequence[str], device: str, threads: int = 1) -
         "title": file.title,
         "experiment": sweep.name,
         "axes": {name: list(axis.values) for name, axis in file.axes.items()},
-        "methods": list(sweep.methods),
-        "tasks": file.tasks,
-        "seeds": sweep.seeds,
         "steps": file.steps,
         "evaluation_interval": file.evaluation_interval,
         "evaluation_episodes": file.evaluation_episodes,
         "settings_in_words": "; ".join(sweep.changes),
-        "runs_planned": len(sweep.runs()),
-        "configurations": {run.configuration: {"algo": run.algo, **run.hyperparams} for run in sweep.runs()},
+        **overview(sweep.runs(), sweep.methods, file.tasks),
         "commands": [command],
     }
 
