@@ -13,8 +13,9 @@ from rich.progress import BarColumn, Progress, TextColumn
 from benchmark.heartbeats import PROGRESS
 from benchmark.studies import ERROR, owned
 
-# Seconds over which the speed is measured, and between two lines where there is no terminal
-WINDOW, LINE_INTERVAL = 120.0, 60.0
+# Seconds over which the speed is measured; over which it is for the time left, as a step's cost differs from run to run, and
+# policies that are trained offline take time without any; and between two lines where there is no terminal
+WINDOW, LONG_WINDOW, LINE_INTERVAL = 120.0, 3600.0, 60.0
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,32 @@ def _clock(seconds: float) -> str:
     return f"{hours}:{rest // 60:02}:{rest % 60:02}"
 
 
+class Pace:
+    """
+    Measures the speed of a count that grows.
+
+    :param window: seconds that are looked back upon
+    """
+
+    def __init__(self, window: float):
+        self._window = window
+        self._history: deque[tuple[float, int]] = deque()
+
+    def look(self, now: float, count: int) -> float | None:
+        """
+        Take the count in.
+
+        :param now: the time in seconds
+        :param count: the count
+        :return: its growth per second; None if it has not grown
+        """
+        self._history.append((now, count))
+        while now - self._history[0][0] > self._window:
+            self._history.popleft()
+        then, count_then = self._history[0]
+        return (count - count_then) / (now - then) if now > then and count > count_then else None
+
+
 class Tally:
     """
     Counts a study's runs and steps.
@@ -60,8 +87,7 @@ class Tally:
 
     def __init__(self, steps: int):
         self._steps = steps
-        # Moments, and the steps that had been taken then
-        self._history: deque[tuple[float, int]] = deque()
+        self._pace, self._long_pace = Pace(WINDOW), Pace(LONG_WINDOW)
 
     def look(self, trials: Sequence[FrozenTrial], now: float | None = None) -> Standing:
         """
@@ -77,11 +103,7 @@ class Tally:
         ended = [trial for trial in runs if trial.state.is_finished()]
         taken = self._steps * len(ended) + sum(trial.user_attrs.get(PROGRESS, {}).get("step", 0) for trial in running)
         total = self._steps * len(runs)
-        self._history.append((now, taken))
-        while now - self._history[0][0] > WINDOW:
-            self._history.popleft()
-        start, taken_then = self._history[0]
-        speed = (taken - taken_then) / (now - start) if now > start and taken > taken_then else None
+        long_speed = self._long_pace.look(now, taken)
         failed = sum(ERROR in trial.user_attrs for trial in ended)
         return Standing(
             runs=len(runs),
@@ -89,8 +111,8 @@ class Tally:
             running=len(running),
             failed=failed,
             share=taken / max(total, 1),
-            speed=speed,
-            seconds_left=None if speed is None else (total - taken) / speed,
+            speed=self._pace.look(now, taken),
+            seconds_left=None if long_speed is None else (total - taken) / long_speed,
         )
 
 

@@ -214,6 +214,23 @@ def test_progress_counts_runs_and_measures_the_speed():
     assert "1 of 4 runs done, 1 running, 1 failed, 4 steps/s, 0:00:35 left" in str(second)
 
 
+def test_the_time_left_counts_the_time_in_which_no_environment_moves():
+    tally, waiting = Tally(steps=100), trial_of("b", TrialState.WAITING)
+    tally.look([trial_of("a", TrialState.RUNNING, 0), waiting], now=0.0)
+    tally.look([trial_of("a", TrialState.RUNNING, 100), waiting], now=50.0)
+    # Its policy is trained offline
+    standing = tally.look([trial_of("a", TrialState.RUNNING, 100), waiting], now=200.0)
+    assert standing.speed is None
+    assert standing.seconds_left == pytest.approx(200.0)
+
+
+def test_the_time_left_forgets_what_is_long_past():
+    tally, runs = Tally(steps=1000), [trial_of("b", TrialState.WAITING)]
+    steps_by = {0.0: 0, 4000.0: 10, 7600.0: 910}
+    standings = [tally.look([trial_of("a", TrialState.RUNNING, step), *runs], now) for now, step in steps_by.items()]
+    assert standings[-1].seconds_left == pytest.approx((2000 - 910) / (900 / 3600))
+
+
 def test_the_description_is_plain_data_and_names_each_configuration():
     sweep = load_sweep("e3")
     description = describe(sweep, [], "cpu")
