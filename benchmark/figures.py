@@ -21,7 +21,7 @@ from benchmark.drawing import final_rewards, learning_curves, sensitivity, stabi
 from benchmark.estimates import REPETITIONS
 from benchmark.page import Picture, claims_section, page, pooled_section, study_section
 from benchmark.records import RUNS
-from benchmark.scores import Study, axis_in_words, read_study, score_table
+from benchmark.scores import Study, axis_in_words, longest, read_study, score_table
 from sb3_cgp.files import write_atomically
 
 FOLDER = Path("benchmark/results/sweeps")
@@ -58,12 +58,13 @@ def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPE
     names = [study.name for study in studies]
     if len(set(names)) < len(names):
         raise ValueError(f"Two of these studies have the same name: {', '.join(names)}")
-    together = stability_together(studies, repetitions)
+    in_earnest = longest(studies)
+    together = stability_together(in_earnest, repetitions)
     pictures = [draw(study, repetitions) for study in studies]
     for picture in [*together, *itertools.chain(*pictures)]:
         write_atomically(out / picture.path, picture.content)
     if with_page:
-        found = findings(score_table(studies), read_runtime(), repetitions)
+        found = findings(score_table(in_earnest), read_runtime(), repetitions)
         command = command_line(folders, out, repetitions)
         sections = [f"`{command}` writes this page.", claims_section(found)]
         sections += [pooled_section(picture, f"{command} {FIGURES_ONLY}") for picture in together]

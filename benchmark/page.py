@@ -20,13 +20,14 @@ from benchmark.estimates import (
 )
 from benchmark.files import markdown_table
 from benchmark.provenance import conditions_in_words
-from benchmark.scores import FAILURE_RULE, Study, failed, score_table
+from benchmark.scores import FAILURE_RULE, LENGTH_RULE, Study, failed, score_table
 
 INTRODUCTION = f"""\
 # Results of sweeps
 
 A run's score is the mean return of its final model's own evaluation. {FAILURE_RULE} Figures and tables draw on their own
-study's runs, the claims on those of all studies here; what acting costs was measured apart, by `python -m benchmark.runtime`.
+study's runs, the claims and the figure of all sweeps together on those of all studies here. {LENGTH_RULE}
+What acting costs was measured apart, by `python -m benchmark.runtime`.
 
 Intervals are 95 % percentile bootstraps by rliable; runs are drawn within each task and configuration. Few runs make them
 too narrow: on normally distributed rewards, the interval of an interquartile mean of 2, 3, 4, 5, 10 runs holds the truth in

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,9 @@ from benchmark.records import Record, read_records
 
 # What describes a study, beside its runs
 FACTS = "study.json"
+LENGTH_RULE = (
+    "Where an experiment was run on a task with several numbers of environment steps, the longest runs alone count for them."
+)
 FAILURE_RULE = (
     "A run that failed counts with the lowest return that any evaluation of any run on its task reached, and its learning "
     "curve goes on at that return from its failure on."
@@ -96,6 +99,25 @@ def read_study(folder: Path) -> Study:
         return Study(folder.resolve().name, folder, json.loads((folder / FACTS).read_text()), read_records(folder))
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{folder} is no folder of a study: {Path(error.filename).name} is missing") from error
+
+
+def longest(studies: Sequence[Study]) -> list[Study]:
+    """
+    Leave out what was tried in small, so that it does not weigh as much as what was run in earnest.
+
+    :param studies: the studies
+    :return: them, with only those runs than which their experiment has no longer ones on the task; none that has no such run
+    """
+    steps: dict[tuple[str, str], int] = {}
+    for record in (record for study in studies for record in study.records):
+        sort = record.experiment, record.task
+        steps[sort] = max(steps.get(sort, 0), record.steps)
+    kept = []
+    for study in studies:
+        records = [record for record in study.records if record.steps == steps[record.experiment, record.task]]
+        if records or not study.records:
+            kept.append(replace(study, records=records))
+    return kept
 
 
 def settings_in_words(settings: dict[str, Any]) -> str:

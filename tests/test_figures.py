@@ -3,6 +3,7 @@
 import shlex
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -119,6 +120,27 @@ def test_a_method_whose_runs_all_failed_before_an_evaluation(tmp_path: Path) -> 
     grid = evaluation_grid(study.records, "Pendulum-v1")
     assert curves(records, -7.0, grid).tolist() == [[-7.0] * 4] * 2
     assert "| Pendulum-v1 | PPO |" in figures([study.folder], tmp_path, repetitions=20).read_text()
+
+
+def test_what_was_tried_in_small_leaves_claims_as_they_are(tmp_path: Path, folder: Path) -> None:
+    def claims_and_stability(*studies: str) -> tuple[str, bytes]:
+        out = tmp_path / "-".join(studies)
+        text = figures([tmp_path / study for study in studies], out, repetitions=50).read_text()
+        claims = text[text.index("## The paper's claims") : text.index("## All sweeps together")]
+        return claims, (out / "figures/stability.png").read_bytes()
+
+    for study in ("axis", "axes"):
+        shutil.copytree(folder / study, tmp_path / study)
+    opposite = runs(lambda *run: -200.0 - (score(*run) or 0.0), BASELINES, GRID)
+    write_study(tmp_path / "shorter", [replace(run, steps=run.steps // 2) for run in opposite])
+    write_study(tmp_path / "equal", opposite)
+    write_study(tmp_path / "other", [replace(run, steps=run.steps // 2, experiment="mine") for run in opposite])
+    before = claims_and_stability("axis", "axes")
+    assert claims_and_stability("axis", "axes", "shorter") == before
+    for study in ("equal", "other"):
+        claims, picture = claims_and_stability("axis", "axes", study)
+        assert claims != before[0]
+        assert picture != before[1]
 
 
 def test_settings_stand_in_the_order_of_the_axes(tmp_path: Path) -> None:
