@@ -115,7 +115,7 @@ def longest(studies: Sequence[Study]) -> list[Study]:
     kept = []
     for study in studies:
         records = [record for record in study.records if record.steps == steps[record.experiment, record.task]]
-        if records or not study.records:
+        if records:
             kept.append(replace(study, records=records))
     return kept
 
