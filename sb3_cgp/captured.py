@@ -37,13 +37,12 @@ class Recording:
         try:
             with th.cuda.graph(self._graph, stream=_side_stream(gpu)):
                 self._outputs = function(*self._inputs)
-        except RuntimeError as error:
-            # PyTorch leaves the recording's stream in place
+        except RuntimeError:
+            # PyTorch leaves the recording's stream in place, and no random numbers outside of recordings until one succeeds
             th.cuda.set_stream(usual)
-            reason = error.__context__ or error
-            raise RuntimeError(
-                f"CGP cannot be recorded as a CUDA graph: pass `cuda_graphs=False`. The reason: {reason}"
-            ) from error
+            with th.cuda.graph(th.cuda.CUDAGraph(), stream=_side_stream(gpu)):
+                _clones(self._inputs)
+            raise
 
     def fits(self, inputs: Tensors) -> bool:
         """
@@ -103,7 +102,6 @@ class Captured:
         :param function: takes tensors (or None), and returns a tuple of them; the same in every call
         :param inputs: its arguments
         :return: what it returns
-        :raises RuntimeError: if the recording fails, from which the GPU's state does not recover
         """
         gpu = _gpu_of(inputs)
         # Streams and graphs belong to the GPU that is current
@@ -121,7 +119,13 @@ class Captured:
     def _record(self, function: Callable[..., Tensors], inputs: Tensors, gpu: th.device | None) -> Tensors:
         """Record the function, carry it out both ways, and keep the recording if they agree."""
         generator = th.default_generator if gpu is None else th.cuda.default_generators[gpu.index]
-        recording = Recording(function, inputs)
+        try:
+            recording = Recording(function, inputs)
+        except RuntimeError as error:
+            reason = str(error.__context__ or error).partition("\n")[0]
+            warnings.warn(f"A step cannot be recorded as a CUDA graph, and is slower. The reason: {reason}", stacklevel=2)
+            self._stays_eager = True
+            return function(*inputs)
         random_state, before = generator.get_state(), _clones(self._list_state())
         outputs = _clones(function(*inputs))
         after = _clones(self._list_state())

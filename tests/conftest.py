@@ -1,10 +1,41 @@
-"""What every test shares."""
+"""What every test shares: one thread, and the CPU, so that the same is tested with and without a GPU."""
+
+import os
 
 import pytest
 import torch as th
+
+HAS_GPU = th.cuda.is_available()
+# PyTorch counts GPUs by it, and seeds none of none
+VISIBLE = "CUDA_VISIBLE_DEVICES"
+ALL_GPUS = os.environ.get(VISIBLE)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _cpu():
+    """Hide the GPU: what computes on "auto" is compared with the CPU's results, often to the bit."""
+    with pytest.MonkeyPatch.context() as patch:
+        if HAS_GPU:
+            # It can only be found before it is hidden
+            th.cuda.init()
+        patch.setattr(th.cuda, "is_available", lambda: False)
+        # For the processes that tests start
+        patch.setenv(VISIBLE, "")
+        yield
 
 
 @pytest.fixture(autouse=True)
 def _one_thread():
     # The networks of the tests are too small to gain from more, and test processes run side by side
     th.set_num_threads(1)
+
+
+@pytest.fixture
+def gpu(monkeypatch):
+    """Show the GPU to a test; without one, skip it."""
+    if not HAS_GPU:
+        pytest.skip("needs a GPU")
+    monkeypatch.setattr(th.cuda, "is_available", lambda: True)
+    monkeypatch.delenv(VISIBLE)
+    if ALL_GPUS is not None:
+        monkeypatch.setenv(VISIBLE, ALL_GPUS)

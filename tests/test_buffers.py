@@ -275,7 +275,7 @@ def test_a_gpu_without_enough_memory_leaves_the_buffer_to_the_host(cpu_counts, m
     assert model.learn(40)._n_updates == 10
 
 
-@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.usefixtures("gpu")
 @pytest.mark.parametrize("space", [VECTOR, IMAGE], ids=["vector", "image"])
 def test_sampling_on_a_gpu_is_the_same(space):
     ours, theirs = buffers = [DeviceReplayBuffer(40, space, ACTION, "cuda", 2), ReplayBuffer(40, space, ACTION, CPU, 2)]
@@ -289,7 +289,7 @@ def test_sampling_on_a_gpu_is_the_same(space):
     assert_same(samples(loaded), samples(theirs))
 
 
-@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.usefixtures("gpu")
 def test_models_on_a_gpu_and_on_a_cpu_load_each_others_buffers(tmp_path):
     models = {device: make_model(make_env(), device=device).learn(40) for device in ("cuda", "cpu")}
     assert type(models["cuda"].replay_buffer) is DeviceReplayBuffer

@@ -17,7 +17,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from sb3_cgp import CEM, CGP, captured, gradient
 from sb3_cgp.captured import EAGER_CALLS, Captured, LossWatch
 
-needs_gpu = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+needs_gpu = pytest.mark.usefixtures("gpu")
 # Learning rates are powers of two: a captured one is a float32
 SMALL = dict(
     cuda_graphs=True,
@@ -326,12 +326,12 @@ def make_believe_gpu(monkeypatch):
 
     @contextmanager
     def graph(graph, stream):
-        streams["current"] = stream
+        streams["current"], found.is_recording = stream, True
         # As PyTorch does, not in a `finally`
         yield
-        streams["current"] = usual
+        streams["current"], found.is_recording = found.usual, False
 
-    usual = streams["current"]
+    found = SimpleNamespace(streams=streams, usual=streams["current"], side=side, is_recording=False)
     monkeypatch.setattr(captured, "_gpu_of", lambda inputs: th.device("cuda", 0))
     monkeypatch.setattr(captured, "_side_stream", lambda gpu: side)
     for name, replacement in {
@@ -343,9 +343,10 @@ def make_believe_gpu(monkeypatch):
         "CUDAGraph": lambda: SimpleNamespace(replay=lambda: None),
         "get_sync_debug_mode": lambda: 0,
         "set_sync_debug_mode": lambda mode: None,
+        "default_generators": [th.default_generator],
     }.items():
         monkeypatch.setattr(th.cuda, name, replacement)
-    return SimpleNamespace(streams=streams, usual=usual, side=side)
+    return found
 
 
 def test_rehearsals_run_on_the_side_stream_in_order(make_believe_gpu):
@@ -400,13 +401,22 @@ def test_a_recording_is_made_on_the_side_stream(make_believe_gpu):
     assert recording._inputs[0].item() == 0.0
 
 
-def test_a_recording_that_fails_says_what_to_do_and_restores_the_stream(make_believe_gpu):
+def test_what_cannot_be_recorded_is_carried_out(make_believe_gpu):
     def function(tensor):
-        raise RuntimeError("operation not permitted when stream is capturing")
+        if make_believe_gpu.is_recording:
+            raise RuntimeError("operation not permitted when stream is capturing\nSearch for it")
+        return (2 * tensor,)
 
-    with pytest.raises(RuntimeError, match=r"pass `cuda_graphs=False`\. The reason: operation not permitted"):
-        captured.Recording(function, (th.ones(1),))
+    call = Captured()
+    for _ in range(EAGER_CALLS):
+        call(function, th.ones(1))
+    with pytest.warns(UserWarning, match="The reason: operation not permitted when stream is capturing$"):
+        assert call(function, th.ones(1))[0].item() == 2.0
     assert make_believe_gpu.streams["current"] is make_believe_gpu.usual
+    # Random numbers wait for the end of a recording: another one has ended
+    assert not make_believe_gpu.is_recording
+    assert call(function, th.full((1,), 3.0))[0].item() == 6.0
+    assert call._recording is None
 
 
 @needs_gpu
@@ -416,7 +426,7 @@ def test_graphs_train_as_eager_steps_do(monkeypatch, name):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         models = [
-            make_model(**VARIANTS[name], device="cuda", cuda_graphs=cuda_graphs).learn(60) for cuda_graphs in (True, False)
+            make_model(**VARIANTS[name], device="cuda", cuda_graphs=cuda_graphs).learn(90) for cuda_graphs in (True, False)
         ]
     assert [model._is_captured for model in models] == [True, False]
     assert all(capture._recording is not None for capture in models[0]._captures.values())
@@ -443,7 +453,7 @@ def test_graphs_obey_schedules_and_set_parameters():
     model = make_model(device="cuda", learning_rate=lambda progress: 0.0 if progress < 0.5 else 1e-2)
     model.learn(100)
     trained = [*model.actor.parameters(), *model.critic.parameters()]
-    before = [parameter.clone() for parameter in trained]
+    before = [parameter.detach().clone() for parameter in trained]
     model._current_progress_remaining = 0.1
     model.train(20, 16)
     assert all(map(th.equal, before, trained))
@@ -455,3 +465,22 @@ def test_graphs_obey_schedules_and_set_parameters():
     assert not th.equal(parameters(model), parameters(other))
     # Twenty steps of Adam go hardly farther than twenty times the learning rate
     th.testing.assert_close(parameters(model), parameters(other), rtol=0.0, atol=20 * 2e-2)
+
+
+@needs_gpu
+def test_what_cannot_be_recorded_on_a_gpu_is_carried_out_and_spoils_nothing():
+    def train(cuda_graphs):
+        model = make_model(device="cuda", cuda_graphs=cuda_graphs).learn(60)
+        # Whoever keeps a graph of autograd binds the parameters' gradients to the stream that it was made on
+        kept = [parameter.clone() for parameter in model.policy.parameters()]
+        model.set_parameters(model.get_parameters())
+        return model.learn(60, reset_num_timesteps=False), kept
+
+    before = make_model(device="cuda").learn(60)
+    with pytest.warns(UserWarning, match="A step cannot be recorded as a CUDA graph, and is slower"):
+        taken = train(cuda_graphs=True)[0]
+    assert any(capture._recording is None for capture in taken._captures.values())
+    th.testing.assert_close(parameters(taken), parameters(train(cuda_graphs=False)[0]), rtol=1e-3, atol=1e-4)
+    for model in (before, make_model(device="cuda")):
+        model.learn(60)
+        assert all(capture._recording is not None for capture in model._captures.values())

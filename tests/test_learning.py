@@ -17,9 +17,9 @@ VARIANTS = {
 }
 
 
-def mean_return(env_id, **variant):
+def mean_return(env_id, device="cpu", **variant):
     """Train as `rl_zoo3.train --algo cgp` does, and evaluate over 20 episodes."""
-    model = train_by_zoo(env_id, variant, seed=0)
+    model = train_by_zoo(env_id, variant, seed=0, device=device)
     return evaluate_policy(model, make_vec_env(env_id, seed=1_000), n_eval_episodes=20)[0]
 
 
@@ -32,3 +32,8 @@ def test_every_variant_swings_up_the_pendulum(variant):
 def test_cgp_reaches_on_mujoco():
     # Random torques earn about -43, none at all -12
     assert mean_return("Reacher-v5") >= -10
+
+
+@pytest.mark.usefixtures("gpu")
+def test_cuda_graphs_swing_up_the_pendulum():
+    assert mean_return("Pendulum-v1", device="cuda") >= -200

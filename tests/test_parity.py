@@ -302,7 +302,7 @@ def test_float64_observations_are_computed_in_float32():
     assert model.policy.select_actions(th.zeros(2, 3, dtype=th.float64), model.critic).actions.dtype == th.float32
 
 
-@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.usefixtures("gpu")
 def test_trains_and_loads_on_a_gpu(tmp_path):
     model = learns(make_model(device="cuda"))
     model.save(tmp_path / "model")

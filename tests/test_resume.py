@@ -136,15 +136,14 @@ def short_policy_training(monkeypatch):
     monkeypatch.setattr("sb3_cgp.offline.ROUND", 10)
 
 
-def straight(folder, case):
-    training = Training(folder / "straight", **CASES[case])
+def straight(folder, case, **arguments):
+    training = Training(folder / "straight", **CASES[case], **arguments)
     return training, fingerprint(training, training.run())
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_resumed_training_is_straight_training(tmp_path, case):
-    training, expected = straight(tmp_path, case)
-    resumed = Training(tmp_path / "resumed", **CASES[case])
+def resumed_is_straight(folder, case, **arguments):
+    training, expected = straight(folder, case, **arguments)
+    resumed = Training(folder / "resumed", **CASES[case], **arguments)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # SB3's, whenever a model with an n-step buffer is loaded
@@ -152,6 +151,17 @@ def test_resumed_training_is_straight_training(tmp_path, case):
         assert_same(fingerprint(resumed, resumed.run(47, 83, 118)), expected)
     for step, line in training.written.lines.items():
         assert resumed.written.lines[step] == pytest.approx(line, rel=0, abs=0, nan_ok=True)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_resumed_training_is_straight_training(tmp_path, case):
+    resumed_is_straight(tmp_path, case)
+
+
+@pytest.mark.usefixtures("gpu")
+@pytest.mark.parametrize("case", ["CGP-Online", "CGP-Offline", "averaged actor, delays", "schedules", "VecNormalize"])
+def test_resumed_training_on_a_gpu_is_straight_training(tmp_path, case):
+    resumed_is_straight(tmp_path, case, device="cuda")
 
 
 def any_stops(test):

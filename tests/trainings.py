@@ -121,18 +121,22 @@ class Training:
 
 def fingerprint(training, model):
     """All that a training has made and all that it would go on with, as arrays by name."""
-    found = {name: tensor.numpy() for name, tensor in model.policy.state_dict().items()}
+    found = {name: tensor.numpy(force=True) for name, tensor in model.policy.state_dict().items()}
     for name, optimizer in (("actor", model.actor.optimizer), ("critic", model.critic.optimizer)):
         for index, state in optimizer.state_dict()["state"].items():
-            found |= {f"{name}.{index}.{key}": value.numpy() for key, value in state.items()}
+            found |= {f"{name}.{index}.{key}": value.numpy(force=True) for key, value in state.items()}
     buffer = model.replay_buffer
     for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
         value = getattr(buffer, name, None)
         fields = value if isinstance(value, dict) else {name: value}
-        found |= {f"{name}.{key}": field for key, field in fields.items() if field is not None}
+        found |= {f"{name}.{key}": th.as_tensor(field).numpy(force=True) for key, field in fields.items() if field is not None}
     found["position"] = np.array([buffer.pos, buffer.full, model.num_timesteps, model._n_updates, model._episode_num])
     found["numpy"] = np.random.get_state()[1]  # noqa: NPY002
     found["torch"] = th.get_rng_state().numpy()
+    found |= {
+        f"cuda {gpu}": state.numpy()
+        for gpu, state in enumerate(th.cuda.get_rng_state_all() if model.device.type == "cuda" else [])
+    }
     found["python"] = np.array(random.getstate()[1], dtype=np.uint64)
     found["evaluations"] = np.array(training.evaluation.evaluations_results)
     found["evaluated at"] = np.array(training.evaluation.evaluations_timesteps)
