@@ -1,14 +1,9 @@
 """What every test shares: one thread, and the CPU, so that the same is tested with and without a GPU."""
 
-import os
-
 import pytest
 import torch as th
 
 HAS_GPU = th.cuda.is_available()
-# PyTorch counts GPUs by it, and seeds none of none
-VISIBLE = "CUDA_VISIBLE_DEVICES"
-ALL_GPUS = os.environ.get(VISIBLE)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -16,11 +11,12 @@ def _cpu():
     """Hide the GPU: what computes on "auto" is compared with the CPU's results, often to the bit."""
     with pytest.MonkeyPatch.context() as patch:
         if HAS_GPU:
-            # It can only be found before it is hidden
+            # PyTorch counts GPUs once, then or never
             th.cuda.init()
+            assert th.cuda.device_count() > 0
         patch.setattr(th.cuda, "is_available", lambda: False)
         # For the processes that tests start
-        patch.setenv(VISIBLE, "")
+        patch.setenv("CUDA_VISIBLE_DEVICES", "")
         yield
 
 
@@ -36,6 +32,3 @@ def gpu(monkeypatch):
     if not HAS_GPU:
         pytest.skip("needs a GPU")
     monkeypatch.setattr(th.cuda, "is_available", lambda: True)
-    monkeypatch.delenv(VISIBLE)
-    if ALL_GPUS is not None:
-        monkeypatch.setenv(VISIBLE, ALL_GPUS)
