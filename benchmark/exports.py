@@ -8,12 +8,11 @@ from typing import Any
 from optuna.trial import TrialState
 
 from benchmark.files import write_json
-from benchmark.records import RUNS, Record, read_records, write_records
+from benchmark.records import RUNS, STUDY, Record, read_records, write_records
 from benchmark.storages import open_storage
 from benchmark.studies import Ledger, owned
 from benchmark.sweep_files import SweepError
 
-STUDY = "study.json"
 # Options that say where files and databases are, and may hold a password
 PRIVATE = ("--storage", "--logs", "--results")
 

@@ -8,8 +8,9 @@ from typing import Any
 
 from sb3_cgp.files import write_atomically
 
-# The file of a study's records, within the study's folder
+# The files of a study's folder: its records, and all else that is known of it
 RUNS = "runs.jsonl"
+STUDY = "study.json"
 
 
 def configuration_in_words(method: str, settings: dict[str, Any]) -> str:

@@ -11,10 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmark.records import Record, read_records
+from benchmark.records import STUDY, Record, read_records
 
-# What describes a study, beside its runs
-FACTS = "study.json"
 LENGTH_RULE = (
     "Where an experiment was run on a task with several numbers of environment steps, the longest runs alone count for them."
 )
@@ -96,7 +94,7 @@ def read_study(folder: Path) -> Study:
     :raises FileNotFoundError: if it is no study's folder
     """
     try:
-        return Study(folder.resolve().name, folder, json.loads((folder / FACTS).read_text()), read_records(folder))
+        return Study(folder.resolve().name, folder, json.loads((folder / STUDY).read_text()), read_records(folder))
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{folder} is no folder of a study: {Path(error.filename).name} is missing") from error
 
