@@ -118,14 +118,16 @@ class Captured:
 
     def _record(self, function: Callable[..., Tensors], inputs: Tensors, gpu: th.device | None) -> Tensors:
         """Record the function, carry it out both ways, and keep the recording if they agree."""
-        generator = th.default_generator if gpu is None else th.cuda.default_generators[gpu.index]
         try:
             recording = Recording(function, inputs)
         except RuntimeError as error:
             reason = str(error.__context__ or error).partition("\n")[0]
             warnings.warn(f"A step cannot be recorded as a CUDA graph, and is slower. The reason: {reason}", stacklevel=2)
             self._stays_eager = True
+        # Not in the handler, where the error would keep the failed recording's memory, and join the error of a step that fails
+        if self._stays_eager:
             return function(*inputs)
+        generator = th.default_generator if gpu is None else th.cuda.default_generators[gpu.index]
         random_state, before = generator.get_state(), _clones(self._list_state())
         outputs = _clones(function(*inputs))
         after = _clones(self._list_state())

@@ -1,5 +1,7 @@
 """What every test shares: one thread, and the CPU, so that the same is tested with and without a GPU."""
 
+import signal
+
 import pytest
 import torch as th
 
@@ -32,3 +34,11 @@ def gpu(monkeypatch):
     if not HAS_GPU:
         pytest.skip("needs a GPU")
     monkeypatch.setattr(th.cuda, "is_available", lambda: True)
+
+
+@pytest.fixture
+def heeds_interruptions():
+    """Have a test and the processes that it starts heed Ctrl-C: what a shell has put into the background ignores it."""
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, handler)

@@ -149,15 +149,7 @@ def test_a_worker_of_an_evaluation_that_dies_is_named():
     assert_buried(eval_env)
 
 
-@pytest.fixture
-def _heeds_interruptions():
-    """As in a terminal; what a shell has put into the background ignores them."""
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, handler)
-
-
-@pytest.mark.usefixtures("_heeds_interruptions")
+@pytest.mark.usefixtures("heeds_interruptions")
 def test_an_interruption_from_the_keyboard_that_ends_workers_leaves_an_environment_that_closes():
     env = subproc(None, None)
 

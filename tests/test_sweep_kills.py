@@ -228,11 +228,9 @@ def command_of(sweep, folder, *args):
 def started(command, home):
     """Start a sweep, and see that nothing of it outlives the test."""
     home.mkdir(exist_ok=True)
-    environment = {**os.environ, "HOME": str(home), "PYTHONPATH": str(REPOSITORY), "CUDA_VISIBLE_DEVICES": ""}
+    environment = {**os.environ, "HOME": str(home), "PYTHONPATH": str(REPOSITORY)}
     with open(home / "output.log", "ab") as log:
-        # A shell that runs the tests in the background lets all of them ignore Ctrl-C
-        heed = dict(preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
-        process = subprocess.Popen(command, stdout=log, stderr=log, cwd=home, env=environment, **heed)
+        process = subprocess.Popen(command, stdout=log, stderr=log, cwd=home, env=environment)
     try:
         yield process
     finally:
@@ -269,6 +267,7 @@ def training(url):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("heeds_interruptions")
 def test_a_sweeps_command_is_killed_interrupted_and_goes_on(tmp_path):
     sweep = write_sweep(tmp_path, steps=8000, methods=["TD3"], checkpoint_interval=100)
     url = f"sqlite:///{tmp_path}/studies.db"
