@@ -175,7 +175,7 @@ def narrower(table: pd.DataFrame, repetitions: int) -> list[Part]:
             text = f"{ours:.3f} against {baseline}'s {theirs:.3f}, less by {found.in_words('.3f')}"
             if len(in_common(usual, pair)) < len(in_common(table, pair)):
                 ours, theirs = _each(table, pair, spread)
-                text += f" (with learning rates from {HIGH_LEARNING_RATE:g} on, {ours:.3f} against {theirs:.3f})"
+                text += f" (learning rates from {HIGH_LEARNING_RATE:g} on included, {ours:.3f} against {theirs:.3f})"
             parts.append(Part(text, judge(found, more_than=0)))
     return parts
 

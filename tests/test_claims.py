@@ -130,7 +130,7 @@ def test_high_learning_rates_are_left_out_of_the_spread(find: Any) -> None:
 
     found = find("narrower", runs(score, ["CGP-Online", "TD3"], rates))
     assert found.verdict == SUPPORTED
-    assert "with learning rates from 0.01 on" in found.text
+    assert "learning rates from 0.01 on included" in found.text
 
 
 @pytest.mark.parametrize(("ours", "verdict"), [(80.0, SUPPORTED), (60.0, SUPPORTED), (30.0, CONTRADICTED)])
