@@ -43,15 +43,16 @@ def png(figure: Figure) -> bytes:
     return picture.getvalue()
 
 
-def panels(number: int, share: bool = True) -> tuple[Figure, list[Axes]]:
+def panels(number: int, share: bool = True, columns: int | None = None) -> tuple[Figure, list[Axes]]:
     """
-    Lay out panels, two or three beside each other.
+    Lay out panels beside each other, and in rows.
 
     :param number: how many
     :param share: whether all have the same vertical axis
+    :param columns: how many beside each other; None takes up to two or three, whichever fills the rows
     :return: the figure, and its panels
     """
-    columns = 3 if number == 3 or number > 4 else min(number, 2)
+    columns = columns or (3 if number == 3 or number > 4 else min(number, 2))
     rows = -(-number // columns)
     # No pyplot: its global figure list and its choice of a screen back-end are of no use here
     figure = Figure(figsize=(PANEL[0] * columns, PANEL[1] * rows + 0.7), layout="constrained")
@@ -130,7 +131,8 @@ def stability(table: pd.DataFrame, methods: Sequence[str], repetitions: int = RE
     :return: the picture, as PNG
     """
     tasks = list(dict.fromkeys(table["task"]))
-    figure, grid = panels(2 * len(tasks))
+    # A task's two panels stand beside each other
+    figure, grid = panels(2 * len(tasks), columns=2)
     for task, whole, closer in zip(tasks, grid[::2], grid[1::2], strict=True):
         runs = table[table["task"] == task]
         levels = np.unique(runs["score"])
