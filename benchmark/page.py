@@ -18,6 +18,7 @@ from benchmark.estimates import (
     interquartile_mean,
     probability_of_improvement,
 )
+from benchmark.experiments import FINAL_EPISODES
 from benchmark.files import markdown_table
 from benchmark.provenance import conditions_in_words
 from benchmark.scores import FAILURE_RULE, LENGTH_RULE, Study, failed, score_table
@@ -25,8 +26,10 @@ from benchmark.scores import FAILURE_RULE, LENGTH_RULE, Study, failed, score_tab
 INTRODUCTION = f"""\
 # Results of sweeps
 
-A run's score is the mean return of its final model's own evaluation. {FAILURE_RULE} Figures and tables draw on their own
-study's runs, the claims and the figure of all sweeps together on those of all studies here. {LENGTH_RULE}
+A run's score is the mean return of its final model over {FINAL_EPISODES} episodes, the same for all runs on a task: what other
+episodes would change is in no interval, so small differences may be these episodes' own. {FAILURE_RULE}
+Figures and tables draw on their own study's runs, the claims and the figure of all sweeps together on those of all studies
+here. {LENGTH_RULE}
 What acting costs was measured apart, by `python -m benchmark.runtime`.
 
 Intervals are 95 % percentile bootstraps by rliable; runs are drawn within each task and configuration. Few runs make them
