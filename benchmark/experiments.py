@@ -25,8 +25,6 @@ ZOO_HYPERPARAMS = (
     *("callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "noise_std", "noise_type"),
     *("normalize", "policy_kwargs", "vec_env_wrapper"),
 )
-# Of the final model
-FINAL_EPISODES = 20
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from benchmark.estimates import (
     interquartile_mean,
     probability_of_improvement,
 )
-from benchmark.experiments import FINAL_EPISODES
 from benchmark.files import markdown_table
 from benchmark.provenance import conditions_in_words
+from benchmark.records import FINAL_EPISODES
 from benchmark.scores import FAILURE_RULE, LENGTH_RULE, Study, failed, score_table
 
 INTRODUCTION = f"""\

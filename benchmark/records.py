@@ -11,6 +11,8 @@ from sb3_cgp.files import write_atomically
 # The files of a study's folder: its records, and all else that is known of it
 RUNS = "runs.jsonl"
 STUDY = "study.json"
+# Of the final model, the same for all runs on a task
+FINAL_EPISODES = 20
 
 
 def configuration_in_words(method: str, settings: dict[str, Any]) -> str:
@@ -50,7 +52,7 @@ class Record:
     :param steps: environment steps that it was to take
     :param timesteps: environment steps at each evaluation, ascending
     :param returns: mean return of each evaluation's episodes
-    :param final: mean return of the final model's own evaluation; None for a run that failed
+    :param final: mean return of the final model over ``FINAL_EPISODES`` episodes; None for a run that failed
     :param error: why the run failed, if it did
     :param seconds: what it took on the clock, all attempts together
     """

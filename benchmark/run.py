@@ -22,8 +22,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import sync_envs_normalization
 
-from benchmark.experiments import FINAL_EPISODES, Run
+from benchmark.experiments import Run
 from benchmark.random_actions import register_random_actions
+from benchmark.records import FINAL_EPISODES
 from benchmark.report import EVALUATION_SEED
 from benchmark.storages import STORAGE_ERRORS
 from sb3_cgp.files import write_atomically
