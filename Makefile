@@ -50,7 +50,7 @@ train: $(INSTALLED) ## install, train with rl_zoo3, evaluate and draw the learni
 
 resume: $(INSTALLED) ## go on with an interrupted run of CGP to its end, and report: make resume RUN=logs/cgp/Pendulum-v1_1
 	@test -n "$(RUN)" || { echo "Name the run's folder, as in: make resume RUN=logs/cgp/Pendulum-v1_1" >&2; exit 1; }
-	$(IN_VENV) -m sb3_cgp.resume "$(RUN)"
+	$(IN_VENV) -m sb3_cgp.zoo.resume "$(RUN)"
 	$(IN_VENV) -m benchmark.report --run "$(RUN)"
 
 test: lint ## install, lint and run the quick tests, with coverage

@@ -3,7 +3,7 @@
 Why this exists: rl_zoo3 has no plug-in mechanism. ``python -m rl_zoo3.train --algo cgp`` runs no code of ours unless some
 of it runs with every start of Python, so ``sb3_cgp.pth`` (from Python 3.15 on ``sb3_cgp.start``) calls :func:`install`.
 That only puts one finder on ``sys.meta_path``. When rl_zoo3 has executed one of three of its modules, and not before,
-:mod:`sb3_cgp.zoo` is imported and adds CGP to it.
+:mod:`sb3_cgp.zoo.registration` is imported and adds CGP to it.
 
 Why a module of its own: it must import nothing, and whatever is inside ``sb3_cgp`` imports PyTorch.
 """
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from types import ModuleType
     from typing import Any
 
-# The function of sb3_cgp.zoo to call when rl_zoo3 has executed the module.
+# The function of sb3_cgp.zoo.registration to call when rl_zoo3 has executed the module.
 _FUNCTIONS = {
     "rl_zoo3.utils": "register_algorithm",
     "rl_zoo3.hyperparams_opt": "register_search_space",
@@ -77,10 +77,10 @@ def _register_after_execution(loader: "Any", name: str) -> None:
 
 def _register(function: str) -> None:
     """
-    :param function: name of the function of :mod:`sb3_cgp.zoo` to call
+    :param function: name of the function of :mod:`sb3_cgp.zoo.registration` to call
     """
     try:
-        from sb3_cgp import zoo
+        from sb3_cgp.zoo import registration as zoo
 
         getattr(zoo, function)()
     except Exception as error:

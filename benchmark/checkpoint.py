@@ -15,13 +15,13 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from benchmark.arguments import continuous_environment, count, measuring_parser
-from benchmark.files import markdown_table, publish
-from benchmark.provenance import conditions, conditions_in_words
-from benchmark.timing import summary, timed
+from benchmark.common.arguments import continuous_environment, count, measuring_parser
+from benchmark.common.files import markdown_table, publish
+from benchmark.common.provenance import conditions, conditions_in_words
+from benchmark.speed.timing import summary, timed
 from sb3_cgp import CGP
-from sb3_cgp.checkpoint import gather
-from sb3_cgp.store import StateStore
+from sb3_cgp.resumption.state import gather
+from sb3_cgp.resumption.store import StateStore
 
 NOTES = """\
 Seconds for which training stands still, on {env} with a replay buffer of {transitions} transitions, all of them filled, and

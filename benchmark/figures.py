@@ -15,14 +15,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmark.arguments import count, output_folder
-from benchmark.claims import findings
-from benchmark.drawing import final_rewards, learning_curves, sensitivity, stability, values
-from benchmark.estimates import REPETITIONS
-from benchmark.page import Picture, claims_section, page, pooled_section, study_section
-from benchmark.records import RUNS
-from benchmark.scores import Study, axis_in_words, longest, read_study, score_table
-from sb3_cgp.files import write_atomically
+from benchmark.common.arguments import count, output_folder
+from benchmark.common.records import RUNS
+from benchmark.reporting.claims import findings
+from benchmark.reporting.drawing import final_rewards, learning_curves, sensitivity, stability, values
+from benchmark.reporting.estimates import REPETITIONS
+from benchmark.reporting.page import Picture, claims_section, page, pooled_section, study_section
+from benchmark.reporting.scores import Study, axis_in_words, longest, read_study, score_table
+from sb3_cgp.common.files import write_atomically
 
 FOLDER = Path("benchmark/results/sweeps")
 RUNTIME = Path(__file__).parent / "results/runtime/runtime.json"
@@ -217,7 +217,7 @@ def find(study: str, storage: str | None, out: Path) -> Path:
                 return folder
         raise FileNotFoundError(f"{study} is no folder; to take a study of that name from a storage, name it with --storage")
     # Optuna takes a second to import
-    from benchmark.exports import export_study
+    from benchmark.sweeps.exports import export_study
 
     try:
         return export_study(study, storage, out)

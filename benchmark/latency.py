@@ -15,10 +15,10 @@ import numpy as np
 import onnxruntime
 import torch as th
 
-from benchmark.arguments import continuous_environment, count, measuring_parser
-from benchmark.files import markdown_table, publish
-from benchmark.provenance import conditions, conditions_in_words
-from benchmark.timing import interleaved, ratio, summary
+from benchmark.common.arguments import continuous_environment, count, measuring_parser
+from benchmark.common.files import markdown_table, publish
+from benchmark.common.provenance import conditions, conditions_in_words
+from benchmark.speed.timing import interleaved, ratio, summary
 from sb3_cgp import CGP
 
 PREDICT, WEIGHTS, ONNX = "`predict`", "`load_weights`", "onnxruntime"

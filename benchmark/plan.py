@@ -14,7 +14,7 @@ from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import ALGOS, get_latest_run_id
 from rl_zoo3.exp_manager import ExperimentManager
 
-from benchmark.arguments import count
+from benchmark.common.arguments import count
 
 EVALUATIONS_PER_RUN = 20
 LONGEST_INTERVAL = 10_000

@@ -20,15 +20,15 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 
-from benchmark.arguments import continuous_environment, count, measuring_parser
-from benchmark.files import markdown_table, write_json
-from benchmark.provenance import conditions
+from benchmark.common.arguments import continuous_environment, count, measuring_parser
+from benchmark.common.files import markdown_table, write_json
+from benchmark.common.provenance import conditions
 from benchmark.report import EVALUATION_SEED
-from benchmark.training import train_by_zoo
+from benchmark.speed.training import train_by_zoo
 from sb3_cgp import CEM, CGP
-from sb3_cgp.cem import Score
-from sb3_cgp.files import write_atomically
-from sb3_cgp.scoring import q_score
+from sb3_cgp.common.files import write_atomically
+from sb3_cgp.core.cem import Score
+from sb3_cgp.fast.scoring import q_score
 
 DTYPES = ("float32", "bfloat16")
 EPISODES = 20

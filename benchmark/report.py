@@ -29,9 +29,9 @@ from stable_baselines3.common.monitor import get_monitor_files, load_results
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from benchmark.files import write_json
-from benchmark.provenance import commit, machine, package_versions
-from sb3_cgp.files import write_atomically
+from benchmark.common.files import write_json
+from benchmark.common.provenance import commit, machine, package_versions
+from sb3_cgp.common.files import write_atomically
 
 # Far from the seeds that people train with: rl_zoo3 gives the training's environments the run's own
 EVALUATION_SEED = 10_000

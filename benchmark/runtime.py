@@ -14,12 +14,12 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from benchmark.arguments import continuous_environment, count, measuring_parser
-from benchmark.contenders import CONTENDERS, REFERENCE, RandomAgent, make_agent, takes_cem_dtype
-from benchmark.files import publish
-from benchmark.provenance import conditions
-from benchmark.runtime_table import markdown
-from benchmark.timing import interleaved, ratio, summary
+from benchmark.common.arguments import continuous_environment, count, measuring_parser
+from benchmark.common.files import publish
+from benchmark.common.provenance import conditions
+from benchmark.speed.contenders import CONTENDERS, REFERENCE, RandomAgent, make_agent, takes_cem_dtype
+from benchmark.speed.runtime_table import markdown
+from benchmark.speed.timing import interleaved, ratio, summary
 
 # Episodes between two entries in the log: none is ever written
 NO_LOG = 10**9

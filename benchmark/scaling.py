@@ -17,14 +17,14 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from benchmark.arguments import continuous_environment, count, measuring_parser
-from benchmark.boxes import BoxEnv
-from benchmark.files import write_json
-from benchmark.provenance import conditions
-from benchmark.scaling_figure import draw
-from benchmark.timing import interleaved, summary
+from benchmark.common.arguments import continuous_environment, count, measuring_parser
+from benchmark.common.files import write_json
+from benchmark.common.provenance import conditions
+from benchmark.speed.boxes import BoxEnv
+from benchmark.speed.scaling_figure import draw
+from benchmark.speed.timing import interleaved, summary
 from sb3_cgp import CGP
-from sb3_cgp.files import write_atomically
+from sb3_cgp.common.files import write_atomically
 
 BATCH_SIZE = 128
 # Random steps before the first gradient step
@@ -51,7 +51,7 @@ class Setting:
     :param width: units of each of the two hidden layers
     :param action_dim: action dimensions
     :param observation_dim: observation dimensions
-    :param n_envs: parallel environments; None for one :class:`~benchmark.boxes.BoxEnv` in place of a real one
+    :param n_envs: parallel environments; None for one :class:`~benchmark.speed.boxes.BoxEnv` in place of a real one
     """
 
     algorithm: str

@@ -15,13 +15,13 @@ import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
-from benchmark.arguments import count, measuring_parser
-from benchmark.files import markdown_table, publish
-from benchmark.products import Sizes, bare_products, call_flops, outer_products, product_flops
-from benchmark.provenance import conditions, conditions_in_words
-from benchmark.timing import interleaved, ratio, summary
-from sb3_cgp.cem import CEM, Score
-from sb3_cgp.scoring import q_score, repeated_q_score
+from benchmark.common.arguments import count, measuring_parser
+from benchmark.common.files import markdown_table, publish
+from benchmark.common.provenance import conditions, conditions_in_words
+from benchmark.speed.products import Sizes, bare_products, call_flops, outer_products, product_flops
+from benchmark.speed.timing import interleaved, ratio, summary
+from sb3_cgp.core.cem import CEM, Score
+from sb3_cgp.fast.scoring import q_score, repeated_q_score
 
 DTYPES = {"float32": th.float32, "bfloat16": th.bfloat16}
 VARIATIONS: dict[str, tuple[int, ...]] = {

@@ -16,11 +16,12 @@ from typing import Any
 
 from stable_baselines3.common.utils import get_device
 
-from benchmark.arguments import count, hyperparameter, output_folder
-from benchmark.experiments import Sweep, included_sweeps, load_sweep, overview
-from benchmark.exports import ended_runs, export_study, see_that_none_is_lost, without_places
+from benchmark.common.arguments import count, hyperparameter, output_folder
+from benchmark.common.provenance import conditions
 from benchmark.figures import figures, study_folders
-from benchmark.processes import (
+from benchmark.sweeps.experiments import Sweep, included_sweeps, load_sweep, overview
+from benchmark.sweeps.exports import ended_runs, export_study, see_that_none_is_lost, without_places
+from benchmark.sweeps.processes import (
     add_workers,
     see_that_grace_is_longer,
     share_of_cores,
@@ -28,11 +29,10 @@ from benchmark.processes import (
     stop,
     terminate,
 )
-from benchmark.progress import Tally, display
-from benchmark.provenance import conditions
-from benchmark.storages import STORAGE_ERRORS, open_storage, reason_of
-from benchmark.studies import Ledger
-from benchmark.sweep_files import SweepError
+from benchmark.sweeps.progress import Tally, display
+from benchmark.sweeps.storages import STORAGE_ERRORS, open_storage, reason_of
+from benchmark.sweeps.studies import Ledger
+from benchmark.sweeps.sweep_files import SweepError
 
 # Seconds between two looks at the study
 LOOK = 2.0

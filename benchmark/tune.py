@@ -18,9 +18,9 @@ import torch as th
 from optuna.trial import FrozenTrial, TrialState
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
-from benchmark.arguments import count, hyperparameter
-from benchmark.entries import base_entry, write_entry
-from benchmark.processes import (
+from benchmark.common.arguments import count, hyperparameter
+from benchmark.sweeps.entries import base_entry, write_entry
+from benchmark.sweeps.processes import (
     TERMINATED,
     add_workers,
     listen,
@@ -30,12 +30,12 @@ from benchmark.processes import (
     stop,
     terminate,
 )
-from benchmark.storages import STORAGE_ERRORS, open_storage, patiently, reason_of
-from benchmark.studies import ERROR
-from benchmark.sweep_files import SweepError, known_task
-from benchmark.tuning import PRUNERS, SCORES, SCORING, Tuner, Tuning, best_of, is_over
+from benchmark.sweeps.storages import STORAGE_ERRORS, open_storage, patiently, reason_of
+from benchmark.sweeps.studies import ERROR
+from benchmark.sweeps.sweep_files import SweepError, known_task
+from benchmark.sweeps.tuning import PRUNERS, SCORES, SCORING, Tuner, Tuning, best_of, is_over
 from benchmark.worker import PAUSE
-from sb3_cgp.zoo import register
+from sb3_cgp.zoo.registration import register
 
 # Seconds between two looks at the study
 LOOK = 2.0

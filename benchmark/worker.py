@@ -18,12 +18,12 @@ from typing import Any
 import torch as th
 from filelock import FileLock
 
-from benchmark.arguments import count
-from benchmark.heartbeats import BEAT, Heart, TrialLostError
-from benchmark.processes import TERMINATED, add_heartbeats, listen, see_that_grace_is_longer
-from benchmark.run import MACHINE_ERRORS, forget_states, run_folder, train
-from benchmark.storages import open_storage, patiently
-from benchmark.studies import Claim, Ledger
+from benchmark.common.arguments import count
+from benchmark.sweeps.heartbeats import BEAT, Heart, TrialLostError
+from benchmark.sweeps.processes import TERMINATED, add_heartbeats, listen, see_that_grace_is_longer
+from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, run_folder, train
+from benchmark.sweeps.storages import open_storage, patiently
+from benchmark.sweeps.studies import Claim, Ledger
 
 # Seconds between two looks at a study of which no run waits
 PAUSE = 2.0

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from sb3_cgp.cem import CEM, ActionSelector, Selection
-from sb3_cgp.cgp import CGP
-from sb3_cgp.exported import ExportedPolicy
-from sb3_cgp.policies import CGPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_cgp.core.cem import CEM, ActionSelector, Selection
+from sb3_cgp.core.cgp import CGP
+from sb3_cgp.core.policies import CGPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_cgp.export.read import ExportedPolicy
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 

@@ -2,7 +2,7 @@
 
 import torch as th
 
-from sb3_cgp.policies import CGPPolicy
+from sb3_cgp.core.policies import CGPPolicy
 
 # A scaled action beyond this magnitude counts as saturated
 SATURATION = 0.99

@@ -7,8 +7,8 @@ from typing import Any
 
 import torch as th
 
-from benchmark.provenance import conditions
-from benchmark.records import Record, write_records
+from benchmark.common.provenance import conditions
+from benchmark.common.records import Record, write_records
 
 STEPS, INTERVAL = 1_000, 250
 SWEEP = "benchmark.sweep"

@@ -9,10 +9,11 @@ from types import SimpleNamespace
 
 from optuna.trial import TrialState
 
-from benchmark import storages, worker
-from benchmark.experiments import Run, Sweep
-from benchmark.studies import ERROR, KEY, Ledger, owned
-from benchmark.sweep_files import Method, SweepFile
+from benchmark import worker
+from benchmark.sweeps import storages
+from benchmark.sweeps.experiments import Run, Sweep
+from benchmark.sweeps.studies import ERROR, KEY, Ledger, owned
+from benchmark.sweeps.sweep_files import Method, SweepFile
 
 GRACE = 60.0
 

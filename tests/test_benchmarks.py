@@ -13,13 +13,15 @@ from matplotlib.image import imread
 from stable_baselines3.common.env_util import make_vec_env
 from torch import nn
 
-from benchmark import arguments, contenders, latency, products, runtime, scaling, selector
-from benchmark.boxes import BoxEnv
-from benchmark.plain import PlainPolicy
-from benchmark.products import Sizes
-from benchmark.timing import interleaved, ratio, summary, timed
+from benchmark import latency, runtime, scaling, selector
+from benchmark.common import arguments
+from benchmark.speed import contenders, products
+from benchmark.speed.boxes import BoxEnv
+from benchmark.speed.plain import PlainPolicy
+from benchmark.speed.products import Sizes
+from benchmark.speed.timing import interleaved, ratio, summary, timed
 from sb3_cgp import CGP
-from sb3_cgp.scoring import repeated_q_score
+from sb3_cgp.fast.scoring import repeated_q_score
 
 CPU = th.device("cpu")
 COMMANDS = {"latency": latency, "runtime": runtime, "selector": selector, "scaling": scaling}

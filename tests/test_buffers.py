@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cgp import CGP
-from sb3_cgp.buffers import DeviceReplayBuffer, fits_device
+from sb3_cgp.fast.device_replay import DeviceReplayBuffer, fits_device
 
 FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float32)
@@ -176,7 +176,7 @@ def make_model(env, policy="MlpPolicy", **kwargs):
 
 
 def test_the_buffer_stays_sb3s_unless_asked_for(monkeypatch):
-    monkeypatch.setattr("sb3_cgp.buffers.can_capture", lambda device: True)
+    monkeypatch.setattr("sb3_cgp.fast.device_replay.can_capture", lambda device: True)
     monkeypatch.setattr(th.cuda, "mem_get_info", lambda device: (2**30, 2**30))
     assert type(make_model(make_env(), cuda_graphs=False).replay_buffer) is ReplayBuffer
     assert type(make_model(make_env()).replay_buffer) is DeviceReplayBuffer
@@ -189,7 +189,7 @@ def parameters(model):
 @pytest.fixture
 def cpu_counts(monkeypatch):
     """Let the CPU count as a GPU."""
-    monkeypatch.setattr("sb3_cgp.buffers.can_capture", lambda device: True)
+    monkeypatch.setattr("sb3_cgp.fast.device_replay.can_capture", lambda device: True)
     monkeypatch.setattr(th.cuda, "mem_get_info", lambda device: (2**30, 2**30))
 
 

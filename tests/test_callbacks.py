@@ -15,8 +15,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from trainings import SMALL, Do
 
 from sb3_cgp import CGP
-from sb3_cgp.callbacks import TrainingCheckpointCallback
-from sb3_cgp.store import StateStore
+from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
+from sb3_cgp.resumption.store import StateStore
 
 
 def make_model(**arguments):
@@ -129,7 +129,7 @@ def test_sigterm_ends_the_training_with_its_state_whenever_it_comes(at, tmp_path
 
 
 def test_sigterm_ends_the_offline_training_of_a_policy(tmp_path, monkeypatch):
-    monkeypatch.setattr("sb3_cgp.offline.ROUND", 10)
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
     with pytest.raises(SystemExit, match="143"):
         make_model(policy_training="offline").learn(40, [TrainingCheckpointCallback(10, tmp_path), Do(55, terminate)])
     resumed = CGP.resume(tmp_path, make_vec_env("Pendulum-v1"))
@@ -140,7 +140,7 @@ def test_sigterm_ends_the_offline_training_of_a_policy(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("at", [20, 55], ids=["critics", "policy"])
 def test_sigterm_during_an_evaluation(at, tmp_path, monkeypatch):
-    monkeypatch.setattr("sb3_cgp.offline.ROUND", 10)
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
 
     def make(trains):
         env = make_vec_env("Pendulum-v1", seed=2)

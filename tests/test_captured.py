@@ -14,8 +14,10 @@ import pytest
 import torch as th
 from stable_baselines3.common.noise import NormalActionNoise
 
-from sb3_cgp import CEM, CGP, captured, gradient
-from sb3_cgp.captured import EAGER_CALLS, Captured, LossWatch
+from sb3_cgp import CEM, CGP
+from sb3_cgp.fast import cuda_graph_algorithm as gradient
+from sb3_cgp.fast import cuda_graphs as captured
+from sb3_cgp.fast.cuda_graphs import EAGER_CALLS, Captured, LossWatch
 
 needs_gpu = pytest.mark.usefixtures("gpu")
 # Learning rates are powers of two: a captured one is a float32
@@ -71,7 +73,7 @@ def stand_in(monkeypatch):
     """Capture on the CPU, by the stand-in."""
     monkeypatch.setattr(gradient, "can_capture", lambda device: True)
     monkeypatch.setattr(captured, "Recording", StandIn)
-    monkeypatch.setattr("sb3_cgp.offline.ROUND", 10)
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
     monkeypatch.setattr(StandIn, "made", 0)
 
 
@@ -422,7 +424,7 @@ def test_what_cannot_be_recorded_is_carried_out(make_believe_gpu):
 @needs_gpu
 @pytest.mark.parametrize("name", VARIANTS)
 def test_graphs_train_as_eager_steps_do(monkeypatch, name):
-    monkeypatch.setattr("sb3_cgp.offline.ROUND", 10)
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         models = [

@@ -4,7 +4,8 @@ import oracles
 import pytest
 import torch as th
 
-from sb3_cgp import CEM, cem
+from sb3_cgp import CEM
+from sb3_cgp.core import cem
 
 
 def quadratic(peak: th.Tensor):

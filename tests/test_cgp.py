@@ -43,7 +43,7 @@ def same_parameters(model, other):
 @pytest.fixture
 def short_policy_training(monkeypatch):
     """Rounds of 10 steps, so that offline training takes a moment."""
-    monkeypatch.setattr("sb3_cgp.offline.ROUND", 10)
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
 
 
 def test_defaults_are_those_of_appendix_b():

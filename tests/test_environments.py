@@ -33,8 +33,8 @@ from stable_baselines3.common.vec_env import (
     VecTransposeImage,
 )
 
-from sb3_cgp.attributes import NotPlainError, from_plain, plain_attributes, set_plain_attributes, to_plain
-from sb3_cgp.environments import RestorableEnv, environment_state, restore_environment, why_not_restorable
+from sb3_cgp.resumption.environments import RestorableEnv, environment_state, restore_environment, why_not_restorable
+from sb3_cgp.resumption.plain_data import NotPlainError, from_plain, plain_attributes, set_plain_attributes, to_plain
 
 MUJOCO_TASKS = (
     *("Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "InvertedDoublePendulum", "InvertedPendulum"),
@@ -396,7 +396,7 @@ def make_processes(seed, wrapper_class=RestorableEnv, wrap=VecNormalize):
 def test_environments_in_other_processes_go_on_to_the_bit():
     # The noise is drawn from the process's own generator
     noise = {"rl_zoo3.wrappers.ActionNoiseWrapper": dict(noise_std=0.3)}
-    env_wrapper = get_wrapper_class(dict(env_wrapper=[noise, "sb3_cgp.environments.RestorableEnv"]))
+    env_wrapper = get_wrapper_class(dict(env_wrapper=[noise, "sb3_cgp.resumption.environments.RestorableEnv"]))
     check(partial(make_processes, wrapper_class=env_wrapper))
 
 

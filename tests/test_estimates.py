@@ -9,7 +9,8 @@ from finished_studies import record, runs, write_study
 from rliable import metrics
 from rliable.library import get_interval_estimates
 
-from benchmark.estimates import (
+from benchmark.common.records import Record
+from benchmark.reporting.estimates import (
     bootstrap,
     cells_of,
     compare,
@@ -18,8 +19,7 @@ from benchmark.estimates import (
     probability_of_improvement,
     share_reaching,
 )
-from benchmark.records import Record
-from benchmark.scores import Study, curves, evaluation_grid, floors, read_study, score_table, settings_in_words
+from benchmark.reporting.scores import Study, curves, evaluation_grid, floors, read_study, score_table, settings_in_words
 
 
 def study(folder: Path, records: list[Record], name: str = "sweep") -> Study:

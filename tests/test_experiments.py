@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from benchmark.experiments import included_sweeps, load_sweep, sweeps_folder
-from benchmark.sweep_files import SweepError
+from benchmark.sweeps.experiments import included_sweeps, load_sweep, sweeps_folder
+from benchmark.sweeps.sweep_files import SweepError
 
 GOOD = dict(title="A sweep", methods=["TD3", "CGP-Online"], tasks=["Pendulum-v1"], steps=100, seeds=2, evaluation_interval=10)
 PAPER = ["e1", "e3", "e4", "e5", "e6", "e7", "e8"]

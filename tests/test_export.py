@@ -24,8 +24,9 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from torch import nn
 
-from sb3_cgp import CGP, exported
-from sb3_cgp.exported import describe_box
+from sb3_cgp import CGP
+from sb3_cgp.export import read as exported
+from sb3_cgp.export.read import describe_box
 
 FILES = ("policy.onnx", "policy.safetensors", "policy.json")
 VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float32)
@@ -122,7 +123,7 @@ def test_exports_act_as_predict_does(name, tmp_path):
 @pytest.fixture
 def no_onnx(monkeypatch):
     """ONNX takes a second to make: leave it out where it is not at issue."""
-    monkeypatch.setattr("sb3_cgp.export._checked_onnx", lambda *args: b"another")
+    monkeypatch.setattr("sb3_cgp.export.write._checked_onnx", lambda *args: b"another")
 
 
 @pytest.mark.parametrize("name", exported.ACTIVATIONS)

@@ -20,9 +20,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 from trainings import Do
 
 from sb3_cgp import CGP
-from sb3_cgp.callbacks import TrainingCheckpointCallback
-from sb3_cgp.faults import BoundsWatch
-from sb3_cgp.store import StateStore
+from sb3_cgp.guards.faults import BoundsWatch
+from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
+from sb3_cgp.resumption.store import StateStore
 
 ROOT = Path(__file__).parent.parent
 
@@ -115,7 +115,7 @@ def ignore_termination(*values):
 
 def test_workers_that_do_not_heed_sigterm_are_ended_too(monkeypatch):
     """Forked after pygame has begun, they take SIGTERM for an event, and hold the dead one's pipe open."""
-    monkeypatch.setattr("sb3_cgp.faults.GRACE", 0.5)
+    monkeypatch.setattr("sb3_cgp.guards.faults.GRACE", 0.5)
     env = SubprocVecEnv([lambda: Failing(ignore_termination, at=1), lambda: Failing(kill_worker)], start_method="fork")
     with pytest.raises(RuntimeError, match="worker 1"):
         CGP("MlpPolicy", env, **SMALL).learn(300)

@@ -14,11 +14,11 @@ from finished_studies import SWEEP, record, runs, write_study
 from matplotlib.image import imread
 
 from benchmark import figures as command
-from benchmark.drawing import stability
+from benchmark.common.style import FURTHER, METHODS, styles
 from benchmark.figures import figures, main, study_folders
-from benchmark.page import reward_tables
-from benchmark.scores import curves, evaluation_grid, read_study, score_table
-from benchmark.style import FURTHER, METHODS, styles
+from benchmark.reporting.drawing import stability
+from benchmark.reporting.page import reward_tables
+from benchmark.reporting.scores import curves, evaluation_grid, read_study, score_table
 
 GRID = [{"learning_rate": rate, "batch_size": size} for rate in (0.01, 0.001) for size in (64, 32)]
 BASELINES = ["CGP-Online", "TD3", "SAC"]
@@ -216,7 +216,7 @@ def test_named_study_is_taken_from_its_storage(folder: Path, tmp_path: Path, mon
             raise KeyError(name)
         return write_study(results / name, runs(score, BASELINES, GRID[:2]))
 
-    monkeypatch.setitem(sys.modules, "benchmark.exports", SimpleNamespace(export_study=export_study))
+    monkeypatch.setitem(sys.modules, "benchmark.sweeps.exports", SimpleNamespace(export_study=export_study))
     options = ["--storage", "sqlite:///studies.db", "--folder", str(tmp_path), "--repetitions", "20"]
     main(["mine", *options])
     assert "The study mine" in (tmp_path / "results.md").read_text()

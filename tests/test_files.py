@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmark.files import markdown_table
+from benchmark.common.files import markdown_table
 from sb3_cgp import CGP
-from sb3_cgp.files import write_atomically
+from sb3_cgp.common.files import write_atomically
 
 
 def test_markdown_table_lines_up():

@@ -4,7 +4,7 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from benchmark.training import train_by_zoo
+from benchmark.speed.training import train_by_zoo
 
 pytestmark = pytest.mark.slow
 

@@ -112,8 +112,8 @@ def test_failed_training_is_not_reported(clone: Clone) -> None:
 def test_resume_goes_on_with_the_named_run_and_reports_it(clone: Clone) -> None:
     calls, ended = clone.make("resume", "RUN=my logs/cgp/Ant-v5_2")
     assert ended.returncode == 0, ended.stderr
-    assert calls[-2:] == ["-m sb3_cgp.resume <my logs/cgp/Ant-v5_2>", "-m benchmark.report --run <my logs/cgp/Ant-v5_2>"]
-    calls, ended = clone.make("resume", "RUN=logs/cgp/Ant-v5_2", FAIL="sb3_cgp.resume")
+    assert calls[-2:] == ["-m sb3_cgp.zoo.resume <my logs/cgp/Ant-v5_2>", "-m benchmark.report --run <my logs/cgp/Ant-v5_2>"]
+    calls, ended = clone.make("resume", "RUN=logs/cgp/Ant-v5_2", FAIL="sb3_cgp.zoo.resume")
     assert ended.returncode != 0
     assert not starting(calls, "-m benchmark.report")
 

@@ -8,8 +8,9 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
-from sb3_cgp import CGP, products
-from sb3_cgp.perceptron import MANY_ROWS, Perceptron
+from sb3_cgp import CGP
+from sb3_cgp.fast import linear as products
+from sb3_cgp.fast.mlp import MANY_ROWS, Perceptron
 
 N_INPUTS = 11
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch as th
 
-from benchmark import provenance
+from benchmark.common import provenance
 
 
 def test_a_commit_is_named_and_changes_to_it_are_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

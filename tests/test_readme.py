@@ -21,6 +21,6 @@ def test_there_are_examples():
 def test_readme_example_runs(example, monkeypatch, tmp_path):
     learn = CGP.learn
     monkeypatch.setattr(CGP, "learn", lambda self, steps, **kwargs: learn(self, min(steps, LONGEST), **kwargs))
-    monkeypatch.setattr("sb3_cgp.offline.ROUND", 2)
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 2)
     monkeypatch.chdir(tmp_path)
     exec(compile(example, "README.md", "exec"), {"__name__": "__main__"})

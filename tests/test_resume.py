@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from trainings import SMALL, Interruption, Stop, Training, assert_same, fingerprint
 
 from sb3_cgp import CGP
-from sb3_cgp.callbacks import TrainingCheckpointCallback
+from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
 
 
 class Reach(gym.Env):
@@ -133,7 +133,7 @@ CASES = {
 
 @pytest.fixture(autouse=True)
 def short_policy_training(monkeypatch):
-    monkeypatch.setattr("sb3_cgp.offline.ROUND", 10)
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
 
 
 def straight(folder, case, **arguments):

@@ -14,13 +14,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import load_results
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_cgp import CGP, zoo
-from sb3_cgp.logs import cut_monitors
-from sb3_cgp.resume import main
-from sb3_cgp.store import StateStore
+from sb3_cgp import CGP
+from sb3_cgp.resumption.logs import cut_monitors
+from sb3_cgp.resumption.store import StateStore
+from sb3_cgp.zoo import registration as zoo
+from sb3_cgp.zoo.resume import main
 
 EPISODE = 200
-CHECKPOINT = "{'sb3_cgp.callbacks.TrainingCheckpointCallback': dict(save_freq=250)}"
+CHECKPOINT = "{'sb3_cgp.resumption.callbacks.TrainingCheckpointCallback': dict(save_freq=250)}"
 
 
 class Interruption(Exception):
@@ -64,7 +65,7 @@ def start(monkeypatch, arguments):
 
 
 def resume(run):
-    """Resume in this process, as ``python -m sb3_cgp.resume`` does."""
+    """Resume in this process, as ``python -m sb3_cgp.zoo.resume`` does."""
     # TensorBoard puts a folder's files into the order of the second in their names
     time.sleep(1)
     main([str(run)])
@@ -157,7 +158,7 @@ def test_a_run_that_the_keyboard_interrupted_goes_on_although_it_has_a_model(mon
 
 
 def test_a_policys_training_that_the_keyboard_interrupted_goes_on(monkeypatch, tmp_path):
-    monkeypatch.setattr("sb3_cgp.offline.ROUND", 10)
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
     options = dict(policy_training="'offline'", n_timesteps=400)
     start(monkeypatch, command(tmp_path / "straight", **options))
     # Behind the environment's 400 steps, within the policy's training
@@ -271,7 +272,7 @@ def test_a_process_that_was_killed_is_resumed_by_the_command(number, status, vec
     assert killed.wait() == status, killed.stdout.read()
     assert 0 < max(StateStore(run_of(tmp_path / "killed") / "state").steps()) < 3_000
     wait_until_gone(others)
-    resumed = python("sb3_cgp.resume", str(run_of(tmp_path / "killed")))
+    resumed = python("sb3_cgp.zoo.resume", str(run_of(tmp_path / "killed")))
     output, _ = resumed.communicate()
     assert resumed.returncode == 0, output
     assert "Resuming" in output

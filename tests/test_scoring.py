@@ -11,8 +11,9 @@ import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
-from sb3_cgp import products, scoring
-from sb3_cgp.scoring import q_score, repeated_q_score
+from sb3_cgp.fast import linear as products
+from sb3_cgp.fast import scoring
+from sb3_cgp.fast.scoring import q_score, repeated_q_score
 
 N_FEATURES, ACTION_DIM = 7, 3
 
@@ -222,7 +223,7 @@ import resource
 import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from sb3_cgp import CEM
-from sb3_cgp.scoring import q_score
+from sb3_cgp.fast.scoring import q_score
 
 th.set_num_threads(2)
 network, features = th.nn.Sequential(*create_mlp(23, 1, [256, 256])), th.randn(128, 17)

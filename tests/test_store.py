@@ -22,9 +22,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 
-from sb3_cgp import store as store_module
-from sb3_cgp.files import write_atomically
-from sb3_cgp.store import BLOCK_FOLDERS, StateStore
+from sb3_cgp.common.files import write_atomically
+from sb3_cgp.resumption import store as store_module
+from sb3_cgp.resumption.store import BLOCK_FOLDERS, StateStore
 
 ARRAYS = st_numpy.arrays(
     st.sampled_from([np.dtype(each) for each in ("f4", "f8", "i8", "u1", "?", "c16", ">f4", "f2")]),
@@ -309,7 +309,7 @@ def test_whichever_operation_fails_a_whole_state_remains(tmp_path, monkeypatch, 
 FULL_DISK = """
     import sys
     import numpy as np
-    from sb3_cgp.store import StateStore
+    from sb3_cgp.resumption.store import StateStore
     store = StateStore(sys.argv[1] + "/state")
     store.save(1, {"rows": np.zeros(50_000)})
     try:

@@ -17,10 +17,10 @@ from optuna.trial import TrialState
 from studies import GRACE, Clock, Crew, assert_each_run_once, make_sweep, mortal, pretend, pretend_to_train, work_through
 
 from benchmark import worker
-from benchmark.heartbeats import PROGRESS, TrialLostError
-from benchmark.storages import open_storage, patiently
-from benchmark.studies import ERROR, KEY, OUTCOME, Ledger
-from benchmark.sweep_files import SweepError
+from benchmark.sweeps.heartbeats import PROGRESS, TrialLostError
+from benchmark.sweeps.storages import open_storage, patiently
+from benchmark.sweeps.studies import ERROR, KEY, OUTCOME, Ledger
+from benchmark.sweeps.sweep_files import SweepError
 from benchmark.worker import work
 
 

@@ -5,14 +5,14 @@ import json
 import pytest
 from optuna.trial import TrialState, create_trial
 
-from benchmark.experiments import load_sweep
-from benchmark.exports import ended_runs, export_study
-from benchmark.progress import Tally
-from benchmark.records import Record, read_records, write_records
-from benchmark.storages import open_storage
-from benchmark.studies import ERROR, KEY, PROGRESS, Ledger
+from benchmark.common.records import Record, read_records, write_records
 from benchmark.sweep import describe, hyperparameter, load, main, parse, study_name
-from benchmark.sweep_files import SweepError
+from benchmark.sweeps.experiments import load_sweep
+from benchmark.sweeps.exports import ended_runs, export_study
+from benchmark.sweeps.progress import Tally
+from benchmark.sweeps.storages import open_storage
+from benchmark.sweeps.studies import ERROR, KEY, PROGRESS, Ledger
+from benchmark.sweeps.sweep_files import SweepError
 
 SMALL = ["e8", "--task", "Pendulum-v1", "--steps", "400", "--seeds", "1", "--methods", "TD3"]
 

@@ -20,11 +20,11 @@ from optuna.trial import TrialState
 from postgres import Server
 
 from benchmark import worker
-from benchmark.experiments import load_sweep
-from benchmark.exports import export_study
-from benchmark.records import read_records
-from benchmark.storages import open_storage
-from benchmark.studies import KEY, Ledger
+from benchmark.common.records import read_records
+from benchmark.sweeps.experiments import load_sweep
+from benchmark.sweeps.exports import export_study
+from benchmark.sweeps.storages import open_storage
+from benchmark.sweeps.studies import KEY, Ledger
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 BEAT, GRACE = 0.3, 2.0
@@ -196,7 +196,7 @@ def check(tmp_path, least, url_of, server=None, **sweep):
 @pytest.fixture(autouse=True)
 def _short_final_evaluation(monkeypatch):
     # Most of a tiny run's time otherwise
-    monkeypatch.setattr("benchmark.run.FINAL_EPISODES", 2)
+    monkeypatch.setattr("benchmark.sweeps.run.FINAL_EPISODES", 2)
 
 
 @pytest.fixture

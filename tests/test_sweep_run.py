@@ -8,11 +8,11 @@ from rl_zoo3.utils import get_saved_hyperparams
 from stable_baselines3 import TD3
 from stable_baselines3.common.env_util import make_vec_env
 
-from benchmark.experiments import load_sweep
-from benchmark.random_actions import RandomActions
 from benchmark.report import read_curve, run_in
-from benchmark.run import forget_states, run_folder, train
-from sb3_cgp.resumable import ResumableAlgorithm, resumable
+from benchmark.sweeps.experiments import load_sweep
+from benchmark.sweeps.random_actions import RandomActions
+from benchmark.sweeps.run import forget_states, run_folder, train
+from sb3_cgp.resumption.algorithm import ResumableAlgorithm, resumable
 
 TINY = dict(learning_starts=40, batch_size=8, buffer_size=400, policy_kwargs="dict(net_arch=[8, 8])")
 
@@ -82,7 +82,7 @@ def test_reports_are_the_usual_evaluations(tmp_path, run_of):
 
 
 def test_offline_training_adds_no_points_and_is_scored_at_its_end(tmp_path, run_of, monkeypatch):
-    monkeypatch.setattr("sb3_cgp.offline.ROUND", 60)
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 60)
     final, reports = trained(run_of("cgp", **TINY, policy_training="offline"), tmp_path)
     assert list(reports) == [100, 200, 300, 400, 500]
     model = ALGOS["cgp"].load(run_in(tmp_path).model_path)
@@ -191,7 +191,7 @@ def test_a_run_that_was_interrupted_after_its_last_step_has_its_whole_curve(tmp_
         raise Interruption
 
     with monkeypatch.context() as patch:
-        patch.setattr("benchmark.run._final_return", stop)
+        patch.setattr("benchmark.sweeps.run._final_return", stop)
         with pytest.raises(Interruption):
             train(run, tmp_path / "stopped", lambda step, value: None, lambda step: None, "cpu")
     assert trained(run, tmp_path / "stopped") == straight
@@ -200,7 +200,7 @@ def test_a_run_that_was_interrupted_after_its_last_step_has_its_whole_curve(tmp_
 def test_a_tuned_method_goes_on_with_what_the_tasks_entry_says(tmp_path, run_of, monkeypatch):
     """... of normalization, say, which is no argument of the algorithm."""
     entry = {"n_timesteps": 500, "policy": "MlpPolicy", "normalize": True}
-    monkeypatch.setattr("sb3_cgp.zoo.hyperparams_folder", lambda: tmp_path)
+    monkeypatch.setattr("sb3_cgp.zoo.registration.hyperparams_folder", lambda: tmp_path)
     (tmp_path / "cgp.yml").write_text(yaml.safe_dump({"Pendulum-v1": entry}))
     run = run_of("cgp", tuned=True, **TINY, cem_samples=8, cem_elites=2)
     straight = trained(run, tmp_path / "straight")
@@ -210,6 +210,6 @@ def test_a_tuned_method_goes_on_with_what_the_tasks_entry_says(tmp_path, run_of,
 
 def test_a_final_return_that_is_no_number_is_a_failure(tmp_path, run_of, monkeypatch):
     # Optuna's databases could not read it again
-    monkeypatch.setattr("benchmark.run.evaluate_policy", lambda *args, **kwargs: ([1.0, np.nan], [200, 200]))
+    monkeypatch.setattr("benchmark.sweeps.run.evaluate_policy", lambda *args, **kwargs: ([1.0, np.nan], [200, 200]))
     with pytest.raises(FloatingPointError, match="mean return is nan"):
         trained(run_of(**TINY), tmp_path)

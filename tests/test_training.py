@@ -13,8 +13,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch.nn import functional as F
 
 from sb3_cgp import CGP, CGPPolicy, Selection
+from sb3_cgp.core.losses import bootstrap_target, cgp_loss, critic_loss, qgp_loss, smooth_target_actions
 from sb3_cgp.diagnostics import policy_diagnostics
-from sb3_cgp.losses import bootstrap_target, cgp_loss, critic_loss, qgp_loss, smooth_target_actions
 
 
 class TargetActorPolicy(CGPPolicy):

@@ -21,12 +21,13 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from torch import nn
 
-from benchmark import tune, tuning
-from benchmark.entries import base_entry, sampled_entry, write_entry
-from benchmark.studies import ERROR
-from benchmark.sweep_files import SweepError
-from benchmark.tuning import ORIGIN, SCORES, SCORING, Tuner, best_of
-from sb3_cgp.zoo import register
+from benchmark import tune
+from benchmark.sweeps import tuning
+from benchmark.sweeps.entries import base_entry, sampled_entry, write_entry
+from benchmark.sweeps.studies import ERROR
+from benchmark.sweeps.sweep_files import SweepError
+from benchmark.sweeps.tuning import ORIGIN, SCORES, SCORING, Tuner, best_of
+from sb3_cgp.zoo.registration import register
 
 register()
 
@@ -47,7 +48,7 @@ def tuner_of(args, storage, grace=60.0):
 @pytest.fixture
 def work(tmp_path, monkeypatch):
     """Tune in this process, which stands for one that its parent has started."""
-    monkeypatch.setattr("benchmark.run.FINAL_EPISODES", 1)
+    monkeypatch.setattr("benchmark.sweeps.run.FINAL_EPISODES", 1)
 
     def act(*argv, storage=None, grace=60.0, **options):
         storage = storage or InMemoryStorage()
@@ -371,7 +372,7 @@ def test_a_study_is_not_opened_with_other_settings(work, pretend):
 )
 def test_mistakes_end_the_command(tmp_path, monkeypatch, argv, message):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("benchmark.storages.TABLES_TIMEOUT", 0.0)
+    monkeypatch.setattr("benchmark.sweeps.storages.TABLES_TIMEOUT", 0.0)
     Path("others.yml").write_text("Reacher-v5: {gamma: 0.9}")
     Path("objects.py").write_text("hyperparams = {'default': {'policy': object()}}")
     with pytest.raises(SystemExit, match=message):

@@ -18,8 +18,9 @@ from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
 
-from sb3_cgp import CGP, zoo
-from sb3_cgp.callbacks import TrainingCheckpointCallback
+from sb3_cgp import CGP
+from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
+from sb3_cgp.zoo import registration as zoo
 
 PAPER_TASKS = {f"{task}-v{version}" for task in ("HalfCheetah", "Humanoid", "Hopper", "Pusher", "Ant") for version in (4, 5)}
 OTHER_TASKS = {"Pendulum-v1", "MountainCarContinuous-v0"} | {
@@ -91,7 +92,7 @@ def test_default_config_of_other_algorithms_and_a_config_given_are_kept(tmp_path
 
 def test_hyperparams_folder_inside_the_package_or_beside_it(monkeypatch, tmp_path):
     package = tmp_path / "sb3_cgp"
-    monkeypatch.setattr(zoo, "__file__", str(package / "zoo.py"))
+    monkeypatch.setattr(zoo, "__file__", str(package / "zoo" / "registration.py"))
     with pytest.raises(FileNotFoundError, match="install sb3_cgp again"):
         zoo.hyperparams_folder()
     for folder in (tmp_path / "hyperparams", package / "hyperparams"):
@@ -123,7 +124,7 @@ def test_the_default_entry_is_the_default_of_cgp():
     assert entry.pop("n_timesteps") == 1e6
     assert entry.pop("policy") == "MlpPolicy"
     assert entry.pop("policy_kwargs") == "dict(net_arch=[256, 256])"
-    assert entry.pop("callback") == [{"sb3_cgp.callbacks.TrainingCheckpointCallback": {"save_freq": 10_000}}]
+    assert entry.pop("callback") == [{"sb3_cgp.resumption.callbacks.TrainingCheckpointCallback": {"save_freq": 10_000}}]
     assert CGP("MlpPolicy", "Pendulum-v1", buffer_size=1).policy.net_arch == [256, 256]
     defaults = {name: parameter.default for name, parameter in inspect.signature(CGP).parameters.items()}
     assert entry == {name: defaults[name] for name in entry}
@@ -167,7 +168,7 @@ def test_every_run_saves_states_in_its_folder_several_times(tmp_path):
 
 def test_a_folder_that_the_user_chose_is_kept_and_none_is_given_without_a_callback(tmp_path):
     zoo.register()
-    callback = [{"sb3_cgp.callbacks.TrainingCheckpointCallback": {"save_freq": 10, "path": "mine"}}]
+    callback = [{"sb3_cgp.resumption.callbacks.TrainingCheckpointCallback": {"save_freq": 10, "path": "mine"}}]
     experiment = manager(tmp_path, hyperparams=TINY | {"callback": callback})
     experiment.setup_experiment()
     assert [each.path for each in checkpoints_of(experiment)] == ["mine"]

@@ -34,7 +34,7 @@ def folder(tmp_path):
         "rl_zoo3/hyperparams_opt.py": "SAMPLER = {}",
         "rl_zoo3/exp_manager.py": "PATCHED = False",
         "sb3_cgp/__init__.py": "",
-        "sb3_cgp/zoo.py": ZOO,
+        "sb3_cgp/zoo/registration.py": ZOO,
     }
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -101,11 +101,11 @@ def test_imports_sb3_cgp_only_once_rl_zoo3_is_imported(folder):
 @pytest.mark.parametrize(
     ("broken", "named"),
     [
-        ({"sb3_cgp/zoo.py": None, "sb3_cgp/__init__.py": None}, "ImportError"),
+        ({"sb3_cgp/zoo/registration.py": None, "sb3_cgp/__init__.py": None}, "ImportError"),
         ({"sb3_cgp/__init__.py": "raise RuntimeError('half installed')"}, "RuntimeError: half installed"),
-        ({"sb3_cgp/zoo.py": "def register_algorithm("}, "SyntaxError"),
-        ({"sb3_cgp/zoo.py": ""}, "AttributeError"),
-        ({"sb3_cgp/zoo.py": ZOO + "\ndel register_default_config"}, "AttributeError"),
+        ({"sb3_cgp/zoo/registration.py": "def register_algorithm("}, "SyntaxError"),
+        ({"sb3_cgp/zoo/registration.py": ""}, "AttributeError"),
+        ({"sb3_cgp/zoo/registration.py": ZOO + "\ndel register_default_config"}, "AttributeError"),
     ],
 )
 def test_a_broken_sb3_cgp_costs_rl_zoo3_one_warning(folder, broken, named):

@@ -1,0 +1,1 @@
+"""What the experiments, the measurements and the reports share."""

@@ -1,0 +1,132 @@
+"""What a figure was measured with: versions and hardware, for the records beside it."""
+
+import os
+import platform
+import shlex
+import subprocess
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch as th
+
+from sb3_cgp.fast.scoring import scoring_dtype
+
+PACKAGES = (
+    "sb3-cgp",
+    "rl_zoo3",
+    "stable_baselines3",
+    "sb3_contrib",
+    "sbx-rl",
+    "torch",
+    "onnxruntime",
+    "jax",
+    "gymnasium",
+    "mujoco",
+    "numpy",
+)
+
+
+def package_versions() -> dict[str, str | None]:
+    """
+    List the versions of Python and of the packages that can change a result.
+
+    :return: version by name; None for a package that is not installed
+    """
+    versions: dict[str, str | None] = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = None
+    return versions
+
+
+def cpu_model() -> str:
+    """
+    Name the processor as its system does.
+
+    :return: the name; the architecture's where the system gives no better
+    """
+    # platform.processor() is empty or only the architecture on Linux
+    cpu_info = Path("/proc/cpuinfo")
+    if cpu_info.is_file():
+        for line in cpu_info.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def machine(device: th.device) -> dict[str, Any]:
+    """
+    Describe the hardware in use.
+
+    :param device: where the networks live
+    :return: operating system, processor, its instruction set and CEM's data type on it, cores, PyTorch's threads, device, and
+        the GPU's name
+    """
+    return {
+        "system": platform.platform(),
+        "cpu": cpu_model(),
+        "cpu_capability": th.backends.cpu.get_cpu_capability(),
+        # What `cem_dtype="auto"` stands for here
+        "cem_dtype": str(scoring_dtype("auto", device)).removeprefix("torch."),
+        "cores": os.cpu_count(),
+        "torch_threads": th.get_num_threads(),
+        "device": str(device),
+        "gpu": th.cuda.get_device_name(device) if device.type == "cuda" else None,
+    }
+
+
+def commit() -> str | None:
+    """
+    Name the code that runs.
+
+    :return: the commit of the clone that this file lies in, with "+" where files differ from it; None outside of a clone
+    """
+    git = ["git", "-C", str(Path(__file__).parent)]
+    try:
+        name = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True).stdout
+        changes = subprocess.run([*git, "status", "--porcelain", "-uno"], capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return name.strip() + "+" * bool(changes.strip())
+
+
+def conditions(module: str, argv: Sequence[str], device: th.device) -> dict[str, Any]:
+    """
+    Describe how a command measures.
+
+    :param module: the command's module
+    :param argv: its arguments
+    :param device: where it computes
+    :return: the command line, the commit, the versions, the hardware, and how many other processes wanted the processor
+        just before
+    """
+    return {
+        "command": shlex.join(["python", "-m", module, *argv]),
+        "commit": commit(),
+        "versions": package_versions(),
+        "machine": machine(device),
+        # Windows has no such figure
+        "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+    }
+
+
+def conditions_in_words(record: dict[str, Any]) -> str:
+    """
+    Say on two lines how a command measured.
+
+    :param record: holds what :func:`conditions` gave
+    :return: the lines, in Markdown
+    """
+    hardware = record["machine"]
+    place = hardware["gpu"] or hardware["device"]
+    threads = f"{hardware['torch_threads']} thread" + "s" * (hardware["torch_threads"] > 1)
+    versions = ", ".join(f"{package} {version}" for package, version in record["versions"].items() if version is not None)
+    return (
+        f"`{record['command']}` on {hardware['cpu']} ({hardware['cpu_capability']}, {hardware['cores']} cores), "
+        f"{threads}, networks on {place}, CEM by default in {hardware['cem_dtype']}, commit {record['commit']}, "
+        f"load average before the start {record['load_average']}.\n\n{versions}."
+    )

@@ -1,0 +1,97 @@
+"""What is known of a sweep's runs when they have ended: one record each, a line of JSON, for figures and for people."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from sb3_cgp.common.files import write_atomically
+
+# The files of a study's folder: its records, and all else that is known of it
+RUNS = "runs.jsonl"
+STUDY = "study.json"
+# Of the final model, the same for all runs on a task
+FINAL_EPISODES = 20
+
+
+def configuration_in_words(method: str, settings: dict[str, Any]) -> str:
+    """
+    Name a configuration.
+
+    :param method: the method
+    :param settings: the values of the axes, by axis
+    :return: the name
+    """
+    return ",".join([method, *(f"{axis}={value}" for axis, value in sorted(settings.items()))])
+
+
+def run_key(method: str, settings: dict[str, Any], task: str, seed: int) -> str:
+    """
+    Name a run as no other run of its study is named.
+
+    :param method: the method
+    :param settings: the values of the axes, by axis
+    :param task: the environment
+    :param seed: the seed
+    :return: the name
+    """
+    return f"{configuration_in_words(method, settings)},{task},seed={seed}"
+
+
+@dataclass(frozen=True)
+class Record:
+    """
+    A run that has ended: one configuration, one seed.
+
+    :param experiment: the sweep's name, such as "e3"
+    :param method: the method's name, such as "CGP-Online"
+    :param task: the environment
+    :param settings: the values of the sweep's axes, by axis
+    :param seed: the seed
+    :param steps: environment steps that it was to take
+    :param timesteps: environment steps at each evaluation, ascending
+    :param returns: mean return of each evaluation's episodes
+    :param final: mean return of the final model over ``FINAL_EPISODES`` episodes; None for a run that failed
+    :param error: why the run failed, if it did
+    :param seconds: what it took on the clock, all attempts together
+    """
+
+    experiment: str
+    method: str
+    task: str
+    settings: dict[str, Any]
+    seed: int
+    steps: int
+    timesteps: list[int]
+    returns: list[float]
+    final: float | None
+    error: str | None
+    seconds: float | None
+
+    @property
+    def key(self) -> str:
+        """What tells the run from all others of its study."""
+        return run_key(self.method, self.settings, self.task, self.seed)
+
+
+def write_records(folder: Path, records: Iterable[Record]) -> None:
+    """
+    Write the records of a study.
+
+    :param folder: the study's folder
+    :param records: the runs
+    """
+    lines = sorted(json.dumps(asdict(record)) for record in records)
+    write_atomically(folder / RUNS, "".join(f"{line}\n" for line in lines).encode())
+
+
+def read_records(folder: Path) -> list[Record]:
+    """
+    Read the records of a study.
+
+    :param folder: the study's folder
+    :return: the runs
+    :raises FileNotFoundError: if it holds none
+    """
+    return [Record(**json.loads(line)) for line in (folder / RUNS).read_text().splitlines()]

@@ -1,0 +1,231 @@
+"""The results page of sweeps: claims, tables and figures, with the commands that make them."""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from benchmark.common.files import markdown_table
+from benchmark.common.provenance import conditions_in_words
+from benchmark.common.records import FINAL_EPISODES
+from benchmark.reporting.claims import OURS, RULES, Finding
+from benchmark.reporting.estimates import (
+    REPETITIONS,
+    Estimate,
+    cells_of,
+    compare,
+    estimate,
+    interquartile_mean,
+    probability_of_improvement,
+)
+from benchmark.reporting.scores import FAILURE_RULE, LENGTH_RULE, Study, failed, score_table
+
+INTRODUCTION = f"""\
+# Results of sweeps
+
+A run's score is the mean return of its final model over {FINAL_EPISODES} episodes, the same for all runs on a task: what other
+episodes would change is in no interval, so small differences may be these episodes' own. {FAILURE_RULE}
+Figures and tables draw on their own study's runs, the claims and the figure of all sweeps together on those of all studies
+here. {LENGTH_RULE}
+What acting costs was measured apart, by `python -m benchmark.runtime`.
+
+Intervals are 95 % percentile bootstraps by rliable; runs are drawn within each task and configuration. Few runs make them
+too narrow: on normally distributed rewards, the interval of an interquartile mean of 2, 3, 4, 5, 10 runs holds the truth in
+52, 72, 88, 89, 93 % of the cases. There is no interval where a configuration has one run only."""
+# Kinds of errors that are listed for a study
+ERRORS = 5
+
+
+@dataclass(frozen=True)
+class Picture:
+    """
+    A figure on the page.
+
+    :param path: where it lies, from the page's folder
+    :param caption: what it shows
+    :param content: the picture
+    """
+
+    path: str
+    caption: str
+    content: bytes
+
+    def in_words(self, command: str) -> str:
+        """
+        Show the figure.
+
+        :param command: the command that draws it
+        :return: the figure, its caption and the command, in Markdown
+        """
+        return f"![{self.caption}]({self.path})\n\n{self.caption} `{command}`"
+
+
+def study_section(study: Study, pictures: Sequence[Picture], command: str, repetitions: int = REPETITIONS) -> str:
+    """
+    Report on a study.
+
+    :param study: the study
+    :param pictures: its figures
+    :param command: the command that draws them
+    :param repetitions: how often the bootstrap draws runs
+    :return: the section, in Markdown
+    """
+    facts, table = study.facts, score_table([study])
+    parts = [
+        f"## {facts['title']}",
+        progress(study),
+        f"{facts['settings_in_words']}\n\nSeeds {', '.join(map(str, facts['seeds']))}; {facts['steps']:,} steps, evaluated "
+        f"every {facts['evaluation_interval']:,} by {facts['evaluation_episodes']} episodes.",
+        *commands_in_words(facts["commands"]),
+    ]
+    if study.records:
+        parts += [picture.in_words(command) for picture in pictures]
+        parts += ["### Final rewards", *reward_tables(table, study, repetitions)]
+        improvement = improvement_table(table, study.methods, repetitions)
+        if improvement:
+            parts += [f"### How often {OURS} improves", improvement]
+    return "\n\n".join(parts)
+
+
+def commands_in_words(commands: Sequence[dict[str, Any]]) -> list[str]:
+    """
+    Say what trained a study's runs.
+
+    :param commands: the commands, from the first to the last
+    :return: a paragraph for each, in Markdown
+    """
+    if len(commands) == 1:
+        return [f"The runs: {conditions_in_words(commands[0])}"]
+    return [
+        f"From the time when {command['runs_ended']} runs had ended: {conditions_in_words(command)}" for command in commands
+    ]
+
+
+def progress(study: Study) -> str:
+    """
+    Say how many of the planned runs have ended, and why runs failed.
+
+    :param study: the study
+    :return: the lines, in Markdown
+    """
+    planned, lost = study.facts["runs_planned"], [record for record in study.records if failed(record)]
+    lines = [f"{len(study.records):,} of {planned:,} planned runs have ended, {len(lost):,} of them failed."]
+    if len(study.records) < planned:
+        lines[0] += " **The rest is missing: what follows may change.**"
+    reasons = Counter((record.method, _first_line(record.error or "the final reward is no number")) for record in lost)
+    lines += [
+        f"- {method}: `{reason}` ({number} run{'s' * (number > 1)})"
+        for (method, reason), number in reasons.most_common(ERRORS)
+    ]
+    if len(reasons) > ERRORS:
+        lines.append(f"- and {len(reasons) - ERRORS} other kinds of errors")
+    return "\n".join(lines[:1] + [""] * bool(reasons) + lines[1:])
+
+
+def reward_tables(table: pd.DataFrame, study: Study, repetitions: int = REPETITIONS) -> list[str]:
+    """
+    Tabulate final rewards: by method, and, folded away, by configuration.
+
+    :param table: the runs' scores
+    :param study: the study
+    :param repetitions: how often the bootstrap draws runs
+    :return: the tables, in Markdown
+    """
+    tables = [_reward_table(table, ["task", "method"], study, repetitions)]
+    if study.axes:
+        by_configuration = _reward_table(table, ["task", "settings", "method"], study, repetitions)
+        tables.append(f"<details><summary>By configuration</summary>\n\n{by_configuration}\n\n</details>")
+    return tables
+
+
+def _reward_table(table: pd.DataFrame, columns: list[str], study: Study, repetitions: int) -> str:
+    first = {text: number for number, text in enumerate(dict.fromkeys([*table["task"], *table["settings"], *study.methods]))}
+    groups = [([str(name) for name in names], runs) for names, runs in table.groupby(columns)]
+    rows = []
+    for names, runs in sorted(groups, key=lambda group: [first[name] for name in group[0]]):
+        form = _form(table[table["task"] == names[0]]["score"])
+        found = estimate(interquartile_mean, [cells_of(runs, "score")], repetitions)
+        scores = runs["score"]
+        numbers = [f"{value:{form}}" for value in (scores.mean(), scores.min(), scores.max())]
+        rows.append([*names, found.in_words(form), *numbers, str(len(runs)), str(runs["failed"].sum())])
+    header = [*columns, "interquartile mean (95 % interval)", "mean", "lowest", "highest", "runs", "failed"]
+    return markdown_table(header, rows)
+
+
+def _form(scores: pd.Series) -> str:
+    """Choose decimals by the range of a task's rewards: about three digits that matter."""
+    width = float(scores.max() - scores.min())
+    return f".{max(0, 3 - math.floor(math.log10(width))) if width > 0 else 1}f"
+
+
+def improvement_table(table: pd.DataFrame, methods: Sequence[str], repetitions: int = REPETITIONS) -> str:
+    """
+    Tabulate the probability that CGP improves on each other method.
+
+    :param table: the runs' scores
+    :param methods: the methods, in the rows' order
+    :param repetitions: how often the bootstrap draws runs
+    :return: the table, in Markdown; empty without CGP or without others
+    """
+    tasks = list(dict.fromkeys(table["task"]))
+    rows = []
+    for method in methods:
+        scopes = [table[table["task"] == task] for task in tasks] + [table] * (len(tasks) > 1)
+        found = [
+            compare(scope, (OURS, method), probability_of_improvement, "score", repetitions) if method != OURS else None
+            for scope in scopes
+        ]
+        if any(found):
+            rows.append([method, *(_cell(each) for each in found)])
+    if not rows:
+        return ""
+    header = [f"{OURS} against", *tasks, *["all tasks"] * (len(tasks) > 1)]
+    note = (
+        "The probability that a run of it scores more than one of the other method, both of a configuration that both ran, "
+        "with ties as half (95 % interval)."
+    )
+    return f"{markdown_table(header, rows)}\n\n{note}"
+
+
+def _cell(found: Estimate | None) -> str:
+    return "-" if found is None else found.in_words()
+
+
+def _first_line(text: str) -> str:
+    return (text.strip() or "no message").splitlines()[0].replace("`", "'")[:120]
+
+
+def claims_section(findings: Sequence[Finding]) -> str:
+    """
+    Report on the paper's claims.
+
+    :param findings: what the runs say of each
+    :return: the section, in Markdown
+    """
+    rows = [[finding.claim, f"**{finding.verdict}**", finding.text] for finding in findings]
+    lines = ["| " + " | ".join(row) + " |" for row in [["claim", "verdict", "what the data say"], ["---"] * 3, *rows]]
+    return "\n\n".join(["## The paper's claims", "\n".join(lines), RULES])
+
+
+def pooled_section(picture: Picture, command: str) -> str:
+    """
+    Report on several sweeps together.
+
+    :param picture: their stability
+    :param command: the command that draws it
+    :return: the section, in Markdown
+    """
+    return f"## All sweeps together\n\n{picture.in_words(command)}"
+
+
+def page(sections: Sequence[str]) -> str:
+    """
+    Put the page together.
+
+    :param sections: its sections
+    :return: the page, in Markdown
+    """
+    return "\n\n".join([INTRODUCTION, *sections]) + "\n"

@@ -1,0 +1,247 @@
+"""Finished studies, and the score of each run: one table for all statistics and figures."""
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from benchmark.common.records import STUDY, Record, read_records
+
+LENGTH_RULE = (
+    "Where an experiment was run on a task with several numbers of environment steps, the longest runs alone count for them."
+)
+FAILURE_RULE = (
+    "A run that failed counts with the lowest return that any evaluation of any run on its task reached, and its learning "
+    "curve goes on at that return from its failure on."
+)
+
+
+@dataclass(frozen=True)
+class Study:
+    """
+    A sweep, finished or still going on.
+
+    :param name: the folder's name
+    :param folder: where it was read from
+    :param facts: what ``study.json`` says
+    :param records: the runs that have ended
+    """
+
+    name: str
+    folder: Path
+    facts: dict[str, Any]
+    records: list[Record]
+
+    @property
+    def methods(self) -> list[str]:
+        """The methods, the planned ones first."""
+        return list(dict.fromkeys([*self.facts["methods"], *(record.method for record in self.records)]))
+
+    @property
+    def tasks(self) -> list[str]:
+        """The tasks of which a run has ended, the planned ones first."""
+        ended = [record.task for record in self.records]
+        return [task for task in dict.fromkeys([*self.facts["tasks"], *ended]) if task in ended]
+
+    @cached_property
+    def axes(self) -> dict[str, list[Any]]:
+        """The values of each axis that some run has, the planned ones first."""
+        found: dict[str, list[Any]] = {}
+        for record in self.records:
+            for axis, value in record.settings.items():
+                found.setdefault(axis, []).append(value)
+        ordered = {}
+        for axis, values in found.items():
+            known = [*self.facts["axes"].get(axis, []), *values]
+            ordered[axis] = [value for number, value in enumerate(known) if value in values and value not in known[:number]]
+        return ordered
+
+    def place(self, settings: dict[str, Any]) -> tuple[int, ...]:
+        """
+        Say where a configuration stands among all.
+
+        :param settings: value by axis
+        :return: the number of each axis's value; -1 for an axis that it lacks
+        """
+        return tuple(values.index(settings[axis]) if axis in settings else -1 for axis, values in self.axes.items())
+
+    def in_order(self) -> list[Record]:
+        """
+        Sort the runs.
+
+        :return: the runs by task, configuration, method and seed
+        """
+        tasks, methods = self.tasks, self.methods
+
+        def key(record: Record) -> tuple[Any, ...]:
+            return tasks.index(record.task), self.place(record.settings), methods.index(record.method), record.seed
+
+        return sorted(self.records, key=key)
+
+
+def read_study(folder: Path) -> Study:
+    """
+    Read a study.
+
+    :param folder: its folder
+    :return: the study
+    :raises FileNotFoundError: if it is no study's folder
+    """
+    try:
+        return Study(folder.resolve().name, folder, json.loads((folder / STUDY).read_text()), read_records(folder))
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{folder} is no folder of a study: {Path(error.filename).name} is missing") from error
+
+
+def longest(studies: Sequence[Study]) -> list[Study]:
+    """
+    Leave out what was tried in small, so that it does not weigh as much as what was run in earnest.
+
+    :param studies: the studies
+    :return: them, with only those runs than which their experiment has no longer ones on the task; none that has no such run
+    """
+    steps: dict[tuple[str, str], int] = {}
+    for record in (record for study in studies for record in study.records):
+        sort = record.experiment, record.task
+        steps[sort] = max(steps.get(sort, 0), record.steps)
+    kept = []
+    for study in studies:
+        records = [record for record in study.records if record.steps == steps[record.experiment, record.task]]
+        if records:
+            kept.append(replace(study, records=records))
+    return kept
+
+
+def settings_in_words(settings: dict[str, Any]) -> str:
+    """
+    Name a configuration.
+
+    :param settings: value by axis
+    :return: such as "learning rate 0.001, batch size 64"; empty without an axis
+    """
+    return ", ".join(f"{axis_in_words(axis)} {value_in_words(value)}" for axis, value in settings.items())
+
+
+def axis_in_words(axis: str) -> str:
+    """
+    Name an axis.
+
+    :param axis: the axis
+    :return: its name for people
+    """
+    return axis.replace("_", " ")
+
+
+def value_in_words(value: Any) -> str:
+    """
+    Name an axis's value.
+
+    :param value: the value
+    :return: its name for people
+    """
+    if isinstance(value, float):
+        return f"{value:g}"
+    return value if isinstance(value, str) else json.dumps(value).replace('"', "")
+
+
+def failed(record: Record) -> bool:
+    """
+    Tell whether a run has no score of its own.
+
+    :param record: the run
+    :return: whether it raised an error or ended at no number
+    """
+    return record.final is None or not math.isfinite(record.final)
+
+
+def floors(records: Iterable[Record]) -> dict[str, float]:
+    """
+    Find what failed runs count with, as :data:`FAILURE_RULE` says.
+
+    :param records: the runs
+    :return: by task, the lowest return of any evaluation
+    """
+    lowest: dict[str, float] = {}
+    for record in records:
+        finals = [] if record.final is None else [record.final]
+        returns = [value for value in (*record.returns, *finals) if math.isfinite(value)]
+        lowest[record.task] = min([lowest.get(record.task, math.inf), *returns])
+    # Where every run failed before its first evaluation, any number ties them
+    return {task: value if math.isfinite(value) else 0.0 for task, value in lowest.items()}
+
+
+def score_table(studies: Sequence[Study]) -> pd.DataFrame:
+    """
+    Score the runs of studies.
+
+    :param studies: the studies
+    :return: a row per run: study, method, task (with the steps where runs on it differ in them), settings, cell (what it
+        shares with the runs that differ from it in method and seed only), seed, failed, score, and share (the score, with
+        0 for the task's lowest return of any evaluation, and 1 for its best score)
+    """
+    runs = [(study.name, record) for study in studies for record in study.in_order()]
+    lowest = floors(record for _, record in runs)
+    budgets: dict[str, set[int]] = {}
+    for _, record in runs:
+        budgets.setdefault(record.task, set()).add(record.steps)
+    rows = []
+    for study, record in runs:
+        several = len(budgets[record.task]) > 1
+        settings = settings_in_words(record.settings)
+        rows.append(
+            {
+                "study": study,
+                "method": record.method,
+                "task": f"{record.task}, {record.steps:,} steps" if several else record.task,
+                "settings": settings,
+                "values": record.settings,
+                "cell": f"{study} {record.task} {record.steps} {settings}",
+                "seed": record.seed,
+                "failed": failed(record),
+                "score": lowest[record.task] if record.final is None or failed(record) else record.final,
+                "floor": lowest[record.task],
+            }
+        )
+    columns = ["study", "method", "task", "settings", "values", "cell", "seed", "failed", "score", "floor"]
+    table = pd.DataFrame(rows, columns=columns)
+    height = table["score"] - table["floor"]
+    best = height.groupby(table["task"]).transform("max")
+    table["share"] = (height / best.where(best > 0)).fillna(0.0).astype(float)
+    return table
+
+
+def evaluation_grid(records: Iterable[Record], task: str) -> np.ndarray:
+    """
+    List when a task's runs were evaluated.
+
+    :param records: the runs
+    :param task: the task
+    :return: environment steps (E) of all evaluations; none if every run failed before its first
+    """
+    return np.unique([step for record in records if record.task == task for step in record.timesteps]).astype(float)
+
+
+def curves(records: Sequence[Record], floor: float, grid: np.ndarray) -> np.ndarray:
+    """
+    Put learning curves side by side.
+
+    :param records: the runs, at least one
+    :param floor: what a failed run counts with
+    :param grid: environment steps (E)
+    :return: returns (N, E): a run's own, on straight lines between
+    """
+    lines = np.full((len(records), len(grid)), floor)
+    for line, record in zip(lines, records, strict=True):
+        timesteps, returns = np.array(record.timesteps, dtype=float), np.array(record.returns, dtype=float)
+        known = np.isfinite(returns)
+        if known.any():
+            # A failed run has only what it reached
+            shown = grid <= timesteps[known][-1] if failed(record) else np.ones(len(grid), dtype=bool)
+            line[shown] = np.interp(grid[shown], timesteps[known], returns[known])
+    return lines

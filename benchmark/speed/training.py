@@ -1,0 +1,43 @@
+"""Training as rl_zoo3 does it, with its hyperparameters and nothing left behind but the model."""
+
+import argparse
+import os
+import tempfile
+from contextlib import redirect_stdout
+from typing import Any
+
+import torch as th
+from rl_zoo3.exp_manager import ExperimentManager
+
+from sb3_cgp import CGP
+from sb3_cgp.zoo.registration import register
+
+
+def train_by_zoo(env_id: str, hyperparams: dict[str, Any], seed: int, device: th.device | str = "auto") -> CGP:
+    """
+    Train as ``rl_zoo3.train --algo cgp`` does, silently and without evaluations.
+
+    :param env_id: the environment
+    :param hyperparams: hyperparameters that differ from the YAML file's
+    :param seed: the seed
+    :param device: where the networks compute
+    :return: the trained model
+    """
+    register()
+    with tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
+        manager = ExperimentManager(
+            argparse.Namespace(),
+            "cgp",
+            env_id,
+            folder,
+            hyperparams=hyperparams,
+            eval_freq=-1,
+            log_interval=-1,
+            verbose=0,
+            seed=seed,
+            device=str(device),
+        )
+        model, _ = manager.setup_experiment()  # type: ignore[misc]
+        manager.learn(model)
+    assert isinstance(model, CGP)
+    return model

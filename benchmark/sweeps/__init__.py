@@ -1,0 +1,1 @@
+"""Sweeps and tuning as Optuna studies that many processes work off together."""

@@ -1,0 +1,126 @@
+"""Entries of rl_zoo3's YAML files: what a task starts from, what a sample makes of it, and writing the result."""
+
+import argparse
+import contextlib
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
+
+from benchmark.sweeps.sweep_files import Hyperparams
+from sb3_cgp.common.files import write_atomically
+from sb3_cgp.zoo.registration import register
+
+# What only rl_zoo3's samplers of replay buffers suggest
+HER_KWARGS = ("n_sampled_goal", "goal_selection_strategy")
+
+
+def base_entry(algo: str, task: str, conf_file: str | None = None) -> Hyperparams:
+    """
+    Read what a task's hyperparameters are before any is sampled, as ``rl_zoo3.train`` does.
+
+    :param algo: the algorithm's name in rl_zoo3
+    :param task: the environment
+    :param conf_file: a YAML file; by default the algorithm's own
+    :return: the entry
+    :raises ValueError: if the file has none for the task, and no default, or one that no YAML file can hold
+    """
+    register()
+    manager = ExperimentManager(argparse.Namespace(), algo, task, "", config=conf_file, verbose=0)
+    # It prints what it reads
+    with contextlib.redirect_stdout(io.StringIO()):
+        hyperparams, _ = manager.read_hyperparameters()
+    try:
+        return yaml.safe_load(yaml.safe_dump(dict(hyperparams)))
+    except yaml.YAMLError as error:
+        raise ValueError(f"The hyperparameters of {algo} for {task} are no plain data: {error}") from error
+
+
+def sampled_entry(algo: str, base: Hyperparams, params: Mapping[str, Any]) -> Hyperparams:
+    """
+    Put what a trial has suggested in an entry, as a YAML file has it.
+
+    rl_zoo3's samplers return objects that no YAML file can hold. Its converters make hyperparameters of the same suggestions,
+    but not always such that a YAML file may have them.
+
+    :param algo: the algorithm's name in rl_zoo3
+    :param base: the task's entry
+    :param params: the trial's parameters
+    :return: the entry
+    """
+    sampled = HYPERPARAMS_CONVERTER[algo](dict(params))
+    if "policy_kwargs" in sampled:
+        sampled["policy_kwargs"] = _in_python(sampled["policy_kwargs"])
+    her_kwargs = {name: sampled.pop(name) for name in HER_KWARGS if name in sampled} | sampled.pop("replay_buffer_kwargs", {})
+    if her_kwargs:
+        sampled["replay_buffer_kwargs"] = _in_python(_evaluated(base.get("replay_buffer_kwargs", {})) | her_kwargs)
+    entry = {**base, **sampled}
+    # rl_zoo3's converters say "no noise" by None, which is no argument of the algorithms; what the base has goes with it
+    if entry.get("noise_type") is None:
+        entry.pop("noise_type", None)
+        entry.pop("noise_std", None)
+    return entry
+
+
+def _in_python(arguments: Mapping[str, Any]) -> str:
+    """Write a dictionary as rl_zoo3's YAML files do, to be evaluated where ``nn`` is known."""
+    values = {name: f"nn.{value.__name__}" if isinstance(value, type) else repr(value) for name, value in arguments.items()}
+    return f"dict({', '.join(f'{name}={value}' for name, value in values.items())})"
+
+
+def _evaluated(arguments: str | dict[str, Any]) -> dict[str, Any]:
+    # As rl_zoo3 does with the same text
+    return eval(arguments) if isinstance(arguments, str) else arguments
+
+
+def write_entry(path: Path, task: str, entry: Hyperparams, comment: str) -> None:
+    """
+    Write a task's entry into a YAML file, in place of the one that it has; nothing else of the file changes.
+
+    :param path: the file; it is made if it is missing
+    :param task: the environment
+    :param entry: the hyperparameters
+    :param comment: a line on where they come from
+    :raises ValueError: if the file is not one of entries by task, or another entry refers to the one to be replaced
+    """
+    # A link stays one, and lines end as they did
+    path = path.resolve()
+    text = path.read_bytes().decode() if path.is_file() else ""
+    ending = "\r\n" if "\r\n" in text else "\n"
+    try:
+        before = yaml.safe_load(text) or {}
+        start, end = _lines_of(task, text)
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is no YAML file: {error}") from error
+    body = yaml.safe_dump(entry, sort_keys=True, allow_unicode=True)
+    block = [f"{task}:", f"  # {comment}", *(f"  {line}" for line in body.splitlines())]
+    lines = text.splitlines()
+    after = ending.join([*lines[:start], *block, *lines[end:]]) + ending
+    if not isinstance(before, dict) or _loaded(after) != {**before, task: entry}:
+        raise ValueError(f"{path} is not changed: its entry {task} cannot be replaced without a change of others'")
+    write_atomically(path, after.encode())
+
+
+def _loaded(text: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return None
+
+
+def _lines_of(task: str, text: str) -> tuple[int, int]:
+    """Find the lines of a task's entry: from its key to before what follows it, or none at the end of the file."""
+    lines = text.splitlines()
+    root = yaml.compose(text, Loader=yaml.SafeLoader)
+    for key, value in root.value if isinstance(root, yaml.MappingNode) else ():
+        if key.value == task:
+            start, end = key.start_mark.line, value.end_mark.line + (value.end_mark.column > 0)
+            # Comments before the next entry are that entry's
+            while end > start + 1 and (not lines[end - 1].strip() or lines[end - 1].startswith("#")):
+                end -= 1
+            return start, end
+    return len(lines), len(lines)

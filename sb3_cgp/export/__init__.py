@@ -1,0 +1,1 @@
+"""Exporting a policy, and loading an exported policy without pickle."""

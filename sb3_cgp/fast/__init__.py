@@ -1,0 +1,1 @@
+"""Faster ways of doing what the core does."""

@@ -1,0 +1,1 @@
+"""Errors that name the cause where an environment fails or a value is not a number."""

@@ -1,0 +1,1 @@
+"""Resuming a stopped training, to the bit, for any of SB3's off-policy algorithms."""
