@@ -21,7 +21,8 @@ from benchmark.common.provenance import conditions, conditions_in_words
 from benchmark.speed.products import Sizes, bare_products, call_flops, outer_products, product_flops
 from benchmark.speed.timing import interleaved, ratio, summary
 from sb3_cgp.core.cem import CEM, Score
-from sb3_cgp.fast.scoring import q_score, repeated_q_score
+from sb3_cgp.core.policies import repeated_q_score
+from sb3_cgp.fast.scoring import q_score
 
 DTYPES = {"float32": th.float32, "bfloat16": th.bfloat16}
 VARIATIONS: dict[str, tuple[int, ...]] = {

@@ -2,10 +2,12 @@
 
 from pathlib import Path
 
+from sb3_cgp.algorithm import CGP
 from sb3_cgp.core.cem import CEM, ActionSelector, Selection
-from sb3_cgp.core.cgp import CGP
-from sb3_cgp.core.policies import CGPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_cgp.export.read import ExportedPolicy
+from sb3_cgp.fast.policies import CGPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
+from sb3_cgp.resumption.environments import RestorableEnv
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
@@ -18,6 +20,8 @@ __all__ = [
     "ExportedPolicy",
     "MlpPolicy",
     "MultiInputPolicy",
+    "RestorableEnv",
     "Selection",
+    "TrainingCheckpointCallback",
     "__version__",
 ]

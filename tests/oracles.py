@@ -40,9 +40,9 @@ def cem(
     return best_action, mean, [math.sqrt(value) for value in variance]
 
 
-def perceptron(weights: Sequence[th.Tensor], biases: Sequence[th.Tensor], inputs: th.Tensor) -> th.Tensor:
+def mlp(weights: Sequence[th.Tensor], biases: Sequence[th.Tensor], inputs: th.Tensor) -> th.Tensor:
     """
-    A multi-layer perceptron with rectifiers in float64, one matrix product at a time.
+    A multilayer perceptron with ReLU in float64, one matrix product at a time.
 
     :param weights: each layer's weights
     :param biases: each layer's biases

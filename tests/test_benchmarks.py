@@ -21,7 +21,7 @@ from benchmark.speed.plain import PlainPolicy
 from benchmark.speed.products import Sizes
 from benchmark.speed.timing import interleaved, ratio, summary, timed
 from sb3_cgp import CGP
-from sb3_cgp.fast.scoring import repeated_q_score
+from sb3_cgp.core.policies import repeated_q_score
 
 CPU = th.device("cpu")
 COMMANDS = {"latency": latency, "runtime": runtime, "selector": selector, "scaling": scaling}
@@ -114,7 +114,7 @@ def test_plain_policy_selects_what_the_fast_one_selects():
         th.manual_seed(7)
         selections.append(model.policy.select_actions(observations, model.critic))
     th.testing.assert_close(selections[0].actions, selections[1].actions, rtol=1e-4, atol=1e-4)
-    th.testing.assert_close(selections[0].spread, selections[1].spread, rtol=1e-4, atol=1e-4)
+    th.testing.assert_close(selections[0].std, selections[1].std, rtol=1e-4, atol=1e-4)
 
 
 def test_plain_policy_repeats_every_observation():

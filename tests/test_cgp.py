@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import warnings
 import zipfile
 
 import gymnasium as gym
@@ -10,11 +11,15 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import TD3
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_cgp import CEM, CGP, CGPPolicy, CnnPolicy, MultiInputPolicy
 
@@ -58,7 +63,7 @@ def test_defaults_are_those_of_appendix_b():
     assert [parameter.shape[0] for parameter in model.actor.parameters()] == [256, 256, 256, 256, 1, 1]
     assert len(model.critic.q_networks) == 2
     assert model.actor.optimizer.defaults["weight_decay"] == 0
-    assert model.inference == "actor"
+    assert (model.inference, model.policy.inference) == (None, "actor")
 
 
 def test_takes_every_argument_of_td3():
@@ -160,7 +165,7 @@ def test_without_a_policy_loss_cem_acts_and_no_actor_is_trained():
     model = make_model(policy_loss=None)
     before = [parameter.clone() for parameter in model.actor.parameters()]
     model.learn(100)
-    assert model.inference == model.policy.inference == "cem"
+    assert (model.inference, model.policy.inference) == (None, "cem")
     assert all(th.equal(a, b) for a, b in zip(before, model.actor.parameters(), strict=True))
 
 
@@ -249,7 +254,7 @@ class TestOffline:
     def test_can_be_called_on_a_loaded_model_with_a_loaded_buffer(self, tmp_path):
         # Interrupted before the policy's training
         model = make_model(policy_training="offline")
-        super(CGP, model).learn(100)
+        OffPolicyAlgorithm.learn(model, 100)
         model.save(tmp_path / "model")
         model.save_replay_buffer(tmp_path / "buffer")
 
@@ -297,9 +302,118 @@ def test_loading_changes_arguments_and_checks_them(tmp_path):
         CGP.load(tmp_path / "model", tau=-3)
     with pytest.raises(ValueError, match="`policy_delay` is 'banana', but must be an integer >= 1"):
         CGP.load(tmp_path / "model", policy_delay="banana")
+    assert CGP.load(tmp_path / "model", inference=None).policy.inference == "actor"
     # As rl_zoo3's enjoy does
-    assert CGP.load(tmp_path / "model", inference=None).inference == "actor"
     assert CGP.load(tmp_path / "model", custom_objects=dict(learning_rate=0.0, lr_schedule=lambda _: 0.0))
+
+
+@pytest.mark.parametrize(
+    ("saved", "loaded", "inference"),
+    [
+        (dict(), dict(policy_loss=None), "cem"),
+        (dict(policy_loss=None), dict(policy_loss="cgp"), "actor"),
+        (dict(policy_loss=None), dict(policy_loss="qgp"), "actor"),
+        (dict(policy_loss=None), dict(policy_loss="cgp", policy_training="offline"), "cem"),
+        (dict(inference="averaged_actor"), dict(policy_loss="qgp"), "averaged_actor"),
+        (dict(inference="averaged_actor"), dict(inference=None), "actor"),
+    ],
+    ids=str,
+)
+def test_defaults_that_depend_on_other_arguments_are_resolved_when_loading(saved, loaded, inference, tmp_path):
+    make_model(**saved).save(tmp_path / "model")
+    model = CGP.load(tmp_path / "model", env=gym.make("Pendulum-v1"), **loaded)
+    assert model.policy.inference == inference
+    assert model.inference == loaded.get("inference", saved.get("inference"))
+    # What it resolves to is saved as an argument no more than before
+    model.save(tmp_path / "again")
+    assert CGP.load(tmp_path / "again").inference == model.inference
+
+
+@pytest.mark.parametrize("how", ["constructor", "attribute", "class"])
+def test_a_policy_subclass_keeps_a_selector_of_its_own(how, tmp_path):
+    own = CEM(1, 3, 1)
+
+    class Own(CGPPolicy):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs | (dict(selector=own) if how == "constructor" else {}))
+            if how == "attribute":
+                self.selector = own
+
+    if how == "class":
+        Own.make_score = lambda self, q_network, features: lambda actions: actions.sum(dim=2)
+        Own.__init__ = lambda self, *args, **kwargs: CGPPolicy.__init__(self, *args, **kwargs | dict(selector=own))
+    model = make_model(policy=Own).learn(60)
+    assert model.policy.selector is own
+    # And one that has none gets CEM by the arguments
+    assert repr(make_model(cem_iterations=3).policy.selector).startswith("CEM(iterations=3, samples=8")
+
+
+class Caching(BaseFeaturesExtractor):
+    """Keeps a tensor that it computed at its first forward."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space, 3)
+        self.scale = None
+
+    def forward(self, observations):
+        if self.scale is None:
+            self.scale = th.ones_like(observations[:1]) * 2
+        return observations * self.scale
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.usefixtures("short_policy_training")
+def test_a_module_may_keep_a_tensor_of_its_first_forward(variant):
+    kwargs = dict(net_arch=[16], features_extractor_class=Caching)
+    model = make_model(**VARIANTS[variant], policy_kwargs=kwargs, learning_starts=5)
+    # Acting comes first
+    model.policy.set_training_mode(False)
+    for inference in ("cem", "actor"):
+        with model.policy.acting_by(inference):
+            model.predict(model.observation_space.sample())
+    assert model.learn(20)._n_updates == 15
+
+
+def test_n_step_returns_obey_the_arguments_of_load(tmp_path):
+    model = make_model(n_steps=3, gamma=0.99).learn(60)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    for n_steps, gamma in ((3, 0.5), (2, 0.99), (1, 0.9)):
+        with warnings.catch_warnings():
+            # No warning that `n_steps` is ignored
+            warnings.simplefilter("error")
+            loaded = CGP.load(tmp_path / "model", gym.make("Pendulum-v1"), n_steps=n_steps, gamma=gamma).learn(60)
+        assert getattr(loaded.replay_buffer, "n_steps", 1) == n_steps
+        assert getattr(loaded.replay_buffer, "gamma", gamma) == gamma
+    # A buffer that was saved with other ones
+    loaded = CGP.load(tmp_path / "model", gym.make("Pendulum-v1"), gamma=0.5)
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    loaded.learn(10, reset_num_timesteps=False)
+    assert set(loaded.replay_buffer.sample(64).discounts.flatten().tolist()) <= {0.5, 0.5**2, 0.5**3}
+    # An attribute that changes between two trainings
+    loaded.gamma = 0.25
+    loaded.learn(10, reset_num_timesteps=False)
+    assert loaded.replay_buffer.gamma == 0.25
+
+
+def test_what_sb3_chooses_is_not_stored_in_the_arguments(tmp_path):
+    kwargs = {}
+    model = make_model(n_steps=3, replay_buffer_kwargs=kwargs)
+    assert (model.replay_buffer_class, model.replay_buffer_kwargs, kwargs) == (None, {}, {})
+    model.save(tmp_path / "model")
+    loaded = CGP.load(tmp_path / "model", gym.make("Pendulum-v1"), replay_buffer_class=ReplayBuffer, n_steps=1).learn(60)
+    assert type(loaded.replay_buffer) is ReplayBuffer
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.usefixtures("short_policy_training")
+def test_diagnostics_do_not_change_the_training(variant):
+    arguments = dict(VARIANTS[variant], batch_size=4, action_noise=NormalActionNoise(np.zeros(1), np.ones(1)))
+    models = [make_model(**arguments, diagnostics=diagnostics).learn(300) for diagnostics in (True, False)]
+    assert ["train/cem_std" in model.logger.name_to_value for model in models] == [variant[4:] != "Offline", False]
+    assert same_parameters(*models)
+    assert all(model.replay_buffer.pos == 300 for model in models)
+    assert np.array_equal(*(model.replay_buffer.actions for model in models))
 
 
 def test_a_loaded_model_allocates_its_buffer_when_it_trains(tmp_path):
@@ -350,7 +464,9 @@ def test_a_policy_saved_alone_keeps_every_argument(policy_class, tmp_path):
     policy = policy_class(space, spaces.Box(-2, 2, (2,)), lambda _: 1e-3, net_arch=[8], activation_fn=th.nn.Tanh, n_critics=3,
                           selector=CEM(3, 10, 2), inference="cem", cem_dtype="float32",
                           optimizer_kwargs=dict(weight_decay=0.1))  # fmt: skip
-    named = set(inspect.signature(CGPPolicy.__init__).parameters) - {"self"}
+    classes = [each for each in policy_class.__mro__ if issubclass(each, TD3Policy)]
+    named = {name for each in classes for name in inspect.signature(each.__init__).parameters} - {"self", "args", "kwargs"}
+    assert {"net_arch", "selector", "cem_dtype", "n_critics"} <= named
     assert named <= set(policy._get_constructor_parameters())
     policy.save(tmp_path / "policy")
     loaded = policy_class.load(tmp_path / "policy")
@@ -399,14 +515,14 @@ EMPTY = spaces.Box(np.ones(1, np.float32), np.ones(1, np.float32))
         (dict(cem_result="median"), "`cem_result` is 'median', but must be one of 'best', 'mean'"),
         (dict(cem_dtype="float16"), "`cem_dtype` is 'float16', but must be one of 'auto', 'float32', 'bfloat16'"),
         (dict(cuda_graphs="yes"), "`cuda_graphs` is 'yes', but must be True or False"),
-        (dict(policy_kwargs=dict(cem_dtype="float32")), "'cem_dtype'.*outside them"),
+        (dict(policy_kwargs=dict(cem_dtype="float32")), "'cem_dtype'.*outside `policy_kwargs`"),
         (dict(batch_size=0), "`batch_size` is 0, but must be an integer >= 1"),
         (dict(buffer_size=0), "`buffer_size` is 0, but must be an integer >= 1"),
         (dict(n_steps=0), "`n_steps` is 0, but must be an integer >= 1"),
         (dict(learning_starts=-1), "`learning_starts` is -1, but must be an integer >= 0"),
         (dict(gradient_steps=-2), "`gradient_steps` is -2, but must be an integer >= -1"),
         (dict(train_freq=[1, "step"]), "`train_freq` is .*, but must be an int, or a tuple of an int and a unit"),
-        (dict(policy_kwargs=dict(inference="cem")), "'inference'.*outside them"),
+        (dict(policy_kwargs=dict(inference="cem")), "'inference'.*outside `policy_kwargs`"),
         (dict(train_freq=0), "`train_freq` is 0, but must be an integer >= 1"),
         (dict(train_freq=(1, "day")), "`train_freq` is .*, but must be in unit 'step' or 'episode'"),
         (dict(policy_delay=0), "`policy_delay` is 0, but must be an integer >= 1"),

@@ -274,7 +274,7 @@ def test_logger_tensorboard_and_checkpoints(tmp_path):
     model.set_logger(configure(str(tmp_path / "csv"), ["csv"]))
     model.learn(400, log_interval=1, reset_num_timesteps=False)
     header = (tmp_path / "csv" / "progress.csv").read_text().splitlines()[0]
-    assert {"train/critic_loss", "train/cem_spread", "rollout/ep_rew_mean", "time/fps"} <= set(header.split(","))
+    assert {"train/critic_loss", "train/cem_std", "rollout/ep_rew_mean", "time/fps"} <= set(header.split(","))
 
 
 def test_learning_goes_on_where_it_stopped():

@@ -75,13 +75,51 @@ def test_training_is_the_same_to_the_bit_as_on_float64(monkeypatch, name):
     assert th.equal(parameters(narrow), parameters(wide))
 
 
-def test_vec_normalize_normalises_what_is_stored_narrowly():
-    env = VecNormalize(DummyVecEnv([Doubles]), gamma=0.99)
-    model = make_model(env).learn(80)
-    assert model.replay_buffer.observations.dtype == np.float32
-    normalised = env.normalize_obs(model.replay_buffer.observations[:80, 0])
-    batch = model.replay_buffer.sample(32, env=env).observations.numpy()
-    assert all(np.abs(normalised - row).max(axis=1).min() < 1e-6 for row in batch)
+class FarFromZero(Doubles):
+    """Observations near 1e6 that differ by less than float32 can tell apart."""
+
+    def observe(self):
+        return 1e6 + 0.01 * self.np_random.normal(size=3)
+
+
+class FarGoals(gym.ObservationWrapper):
+    """The same within a Dict."""
+
+    def __init__(self):
+        super().__init__(FarFromZero())
+        self.observation_space = spaces.Dict(x=self.env.observation_space, y=spaces.Box(-1, 1, (1,), np.float32))
+
+    def observation(self, observation):
+        return dict(x=observation, y=np.zeros(1, np.float32))
+
+
+@pytest.mark.parametrize("env_class", [FarFromZero, FarGoals])
+def test_vec_normalize_normalises_what_was_observed_to_the_bit(env_class):
+    env = VecNormalize(DummyVecEnv([env_class]), gamma=0.99, norm_obs_keys=["x"] if env_class is FarGoals else None)
+    model = make_model(env, "MultiInputPolicy" if env_class is FarGoals else "MlpPolicy").learn(80)
+    stored = model.replay_buffer.observations
+    stored = stored["x"] if isinstance(stored, dict) else stored
+    assert stored.dtype == np.float64
+    # In float32 they would be a few multiples of 1/16
+    assert len(np.unique(stored[:80])) == 240
+    assert model._n_updates == 50
+    rows = stored[:80, 0]
+    normalised = env.normalize_obs(dict(x=rows, y=np.zeros((80, 1)))) if env_class is FarGoals else env.normalize_obs(rows)
+    normalised = normalised["x"] if isinstance(normalised, dict) else normalised
+    batch = model.replay_buffer.sample(32, env=env).observations
+    batch = (batch["x"] if isinstance(batch, dict) else batch).numpy()
+    assert all((normalised.astype(np.float32) == row).all(axis=1).any() for row in batch)
+
+
+def test_normalisation_that_comes_or_goes_later_is_stored_accordingly():
+    plain, normalising = DummyVecEnv([FarFromZero]), VecNormalize(DummyVecEnv([FarFromZero]))
+    rewards_only = VecNormalize(DummyVecEnv([FarFromZero]), norm_obs=False)
+    model = make_model(plain)
+    for env, dtype in ((normalising, np.float64), (rewards_only, np.float32), (plain, np.float32)):
+        model = make_model(plain if env is normalising else normalising)
+        model.set_env(env)
+        model.learn(5)
+        assert model.replay_buffer.observations.dtype == dtype
 
 
 @pytest.mark.parametrize("buffer_class", [DictReplayBuffer, HerReplayBuffer])

@@ -11,9 +11,10 @@ import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
+from sb3_cgp.core.policies import repeated_q_score
 from sb3_cgp.fast import linear as products
 from sb3_cgp.fast import scoring
-from sb3_cgp.fast.scoring import q_score, repeated_q_score
+from sb3_cgp.fast.scoring import q_score
 
 N_FEATURES, ACTION_DIM = 7, 3
 
@@ -28,7 +29,7 @@ NETWORKS = {
     "no hidden layer": mlp([]),
     "one hidden layer": mlp([8]),
     "three layers, tanh": mlp([16, 16, 16], nn.Tanh),
-    "leaky rectifier": mlp([16], nn.LeakyReLU),
+    "leaky ReLU": mlp([16], nn.LeakyReLU),
     "without bias": mlp([16, 16], with_bias=False),
     "layer norm and dropout": nn.Sequential(
         nn.Linear(10, 16), nn.LayerNorm(16), nn.ReLU(), nn.Dropout(0.5), nn.Linear(16, 1)
@@ -65,7 +66,7 @@ def test_scores_are_those_of_the_network_row_by_row():
     for state in range(4):
         for index in range(6):
             inputs = th.cat([features[state], actions[state, index]])
-            expected = oracles.perceptron([layer.weight for layer in layers], [layer.bias for layer in layers], inputs)
+            expected = oracles.mlp([layer.weight for layer in layers], [layer.bias for layer in layers], inputs)
             assert scores[state, index].item() == pytest.approx(expected.item(), abs=1e-5)
 
 
@@ -91,7 +92,7 @@ def rounded_differences(network, features, actions):
         return tensor.bfloat16().double()
 
     def apply(layer, inputs):
-        return oracles.perceptron([layer.weight], [layer.bias], inputs)
+        return oracles.mlp([layer.weight], [layer.bias], inputs)
 
     first, *hidden_layers, last = [layer for layer in network if isinstance(layer, nn.Linear)]
     action_weight = rounded(first.weight[:, N_FEATURES:])
@@ -156,7 +157,7 @@ def test_networks_with_hooks_are_called_as_they_are():
 
 @pytest.mark.parametrize("name", NETWORKS)
 @th.no_grad()
-def test_bfloat16_is_close_for_any_network_and_rounds_only_rectifier_networks(name):
+def test_bfloat16_is_close_for_any_network_and_rounds_only_relu_networks(name):
     network = NETWORKS[name]
     features = th.randn(16, N_FEATURES)
     actions = th.rand(16, 9, ACTION_DIM) * 2 - 1
@@ -203,14 +204,31 @@ def test_without_onednn_scores_are_the_same(monkeypatch, reason):
         functions = SimpleNamespace() if reason == "no such function" else SimpleNamespace(_linear_pointwise=refuse)
         monkeypatch.setattr(th.ops, "mkldnn", functions)
     monkeypatch.setattr(products, "MANY_MULTIPLICATIONS", 1)
-    products.onednn_linear.cache_clear()
+    products._probe_onednn_linear.cache_clear()
     try:
         assert products.onednn_linear(th.float32) is None
         features, actions = th.randn(4, N_FEATURES), th.rand(4, 6, ACTION_DIM)
         for network in (NETWORKS["two hidden layers"], NETWORKS["three layers, tanh"]):
             th.testing.assert_close(q_score(network, features)(actions), repeated_q_score(network, features)(actions))
     finally:
-        products.onednn_linear.cache_clear()
+        products._probe_onednn_linear.cache_clear()
+
+
+def test_onednn_that_is_disabled_is_not_called(monkeypatch):
+    if products.onednn_linear(th.float32) is None:
+        pytest.skip("no oneDNN")
+    called = []
+    probe = products._probe_onednn_linear
+    monkeypatch.setattr(products, "_probe_onednn_linear", lambda dtype: called.append(dtype) or probe(dtype))
+    monkeypatch.setattr(products, "MANY_MULTIPLICATIONS", 1)
+    inputs, weight, bias = th.randn(8, 4), th.randn(5, 4), th.randn(5)
+    expected = products.multiply(inputs, weight, bias)
+    assert len(called) == 1
+    with th.backends.mkldnn.flags(enabled=False):
+        th.testing.assert_close(products.multiply(inputs, weight, bias), expected)
+    assert len(called) == 1
+    products.multiply(inputs, weight, bias)
+    assert len(called) == 2
 
 
 def test_the_private_function_exists_in_the_tested_pytorch():
@@ -251,5 +269,5 @@ def test_comparing_as_integers_is_comparing_numbers():
     values = th.tensor([0.0, -0.0, 1e-30, -1e-30, 0.5, -0.5, 3.0, -3.0, 1e30, -1e30, th.inf, -th.inf])
     ceilings = th.tensor([0.0, -0.0, 1e-30, 0.5, 3.0, th.inf])
     for ceiling in ceilings.bfloat16():
-        lowered = scoring._lower_each(values.bfloat16().view(1, -1, 1), ceiling.abs().view(1, 1, 1))
+        lowered = scoring._clip_above(values.bfloat16().view(1, -1, 1), ceiling.abs().view(1, 1, 1))
         assert lowered.flatten().tolist() == [min(value, ceiling.item()) for value in values.bfloat16().tolist()]

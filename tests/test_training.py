@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch.nn import functional as F
 
 from sb3_cgp import CGP, CGPPolicy, Selection
-from sb3_cgp.core.losses import bootstrap_target, cgp_loss, critic_loss, qgp_loss, smooth_target_actions
+from sb3_cgp.core.losses import POLICY_LOSSES
 from sb3_cgp.diagnostics import policy_diagnostics
 
 
@@ -56,41 +56,6 @@ def test_is_td3_where_the_target_actor_stands_in_for_cem(n_critics):
         th.testing.assert_close(parameters_of(cgp)[name], parameter, rtol=1e-4, atol=1e-6, msg=name)
 
 
-def test_bootstrap_target_by_hand():
-    rewards, dones = [1.0, -2.0, 0.5, 3.0], [0.0, 1.0, 0.0, 1.0]
-    discounts = [0.9, 0.9, 0.81, 0.81]
-    values = [[1.0, 2.0], [5.0, 4.0], [-3.0, 2.0], [0.0, 0.0]]
-    column = lambda numbers: th.tensor(numbers).unsqueeze(1)  # noqa: E731
-    next_q_values = tuple(column([row[j] for row in values]) for j in range(2))
-    targets = bootstrap_target(column(rewards), column(dones), column(discounts), next_q_values)
-    expected = [
-        oracles.bootstrap_target(reward, done == 1.0, discount, row)
-        for reward, done, discount, row in zip(rewards, dones, discounts, values, strict=True)
-    ]
-    assert targets.shape == (4, 1)
-    assert targets.flatten().tolist() == pytest.approx(expected)
-
-
-def test_losses_by_hand():
-    q_values = (th.tensor([[1.0], [2.0]]), th.tensor([[0.0], [5.0]]))
-    targets = th.tensor([[2.0], [4.0]])
-    assert critic_loss(q_values, targets).item() == pytest.approx((1 + 4) / 2 + (4 + 1) / 2)
-    assert qgp_loss(q_values[0]).item() == pytest.approx(-1.5)
-    assert cgp_loss(th.tensor([[0.0, 1.0]]), th.tensor([[0.5, -1.0]])).item() == pytest.approx((0.25 + 4.0) / 2)
-
-
-def test_target_noise_is_gaussian_and_clipped():
-    th.manual_seed(0)
-    actions = th.zeros(100_000, 1)
-    noisy = smooth_target_actions(actions, noise_std=0.2, noise_clip=0.5)
-    assert noisy.abs().max().item() == pytest.approx(0.5)
-    # P(|N(0, 0.2)| > 0.5) = P(|N(0, 1)| > 2.5) = 0.0124
-    assert (noisy.abs() == 0.5).float().mean().item() == pytest.approx(0.0124, abs=0.002)
-    assert noisy.std().item() == pytest.approx(0.198, abs=0.004)
-    assert smooth_target_actions(th.full((1_000, 1), 0.95), 0.2, 0.5).max().item() == 1.0
-    assert th.equal(smooth_target_actions(actions, 0.0, 0.5), actions)
-
-
 def filled_model(**kwargs):
     """A small model whose buffer holds random steps of Pendulum, and a logger that prints nothing."""
     arguments = dict(learning_starts=300, buffer_size=500, batch_size=16, seed=0, policy_kwargs=dict(net_arch=[16]))
@@ -100,11 +65,67 @@ def filled_model(**kwargs):
     return model
 
 
-def q_value(model, network, observation, action):
+def q_value(model, network, observation, action, index=0):
     """One Q-value by the oracle's matrix products."""
-    layers = [layer for layer in network.q_networks[0] if hasattr(layer, "weight")]
+    layers = [layer for layer in network.q_networks[index] if hasattr(layer, "weight")]
     inputs = th.cat([observation, action])
-    return oracles.perceptron([layer.weight for layer in layers], [layer.bias for layer in layers], inputs)
+    return oracles.mlp([layer.weight for layer in layers], [layer.bias for layer in layers], inputs)
+
+
+def losses_of_one_step(model, batch_size=16):
+    """The losses of one gradient step in which no network is changed, and the step's minibatch."""
+    losses, batches = {}, []
+    sample = model.replay_buffer.sample
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(model, "_descend", lambda name, loss: losses.update({name: loss.item()}))
+        patch.setattr(
+            model.replay_buffer, "sample", lambda *args, **kwargs: batches.append(sample(*args, **kwargs)) or batches[0]
+        )
+        model.train(gradient_steps=1, batch_size=batch_size)
+    return losses, batches[0]
+
+
+@pytest.mark.parametrize("n_critics", [1, 2, 3])
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_critic_loss_by_hand(n_critics, n_steps):
+    policy_kwargs = dict(net_arch=[16], n_critics=n_critics, selector=FixedSelector(0.4))
+    arguments = dict(gamma=0.9, target_policy_noise=0.0, tau=1.0, target_update_interval=1)
+    model = filled_model(n_steps=n_steps, policy_kwargs=policy_kwargs, **arguments)
+    model.replay_buffer.dones[::7] = 1
+    model.replay_buffer.timeouts[:] = 0
+    model.train(gradient_steps=2, batch_size=16)
+    losses, batch = losses_of_one_step(model)
+    assert 0 < batch.dones.sum() < 16
+    expected = 0.0
+    for row in range(16):
+        observation, action, next_observation = batch.observations[row], batch.actions[row], batch.next_observations[row]
+        discount = 0.9 if n_steps == 1 else batch.discounts[row].item()
+        next_values = [q_value(model, model.critic_target, next_observation, th.tensor([0.4]), j) for j in range(n_critics)]
+        target = oracles.bootstrap_target(batch.rewards[row].item(), bool(batch.dones[row]), discount, next_values)
+        for j in range(n_critics):
+            expected += (q_value(model, model.critic, observation, action, j).item() - target) ** 2 / 16
+    assert losses["critic"] == pytest.approx(float(expected), rel=1e-4)
+
+
+@pytest.mark.parametrize("selected", [0.0, 0.95])
+@pytest.mark.parametrize("noise_std", [0.0, 0.2])
+def test_target_noise_is_gaussian_and_clipped(selected, noise_std):
+    policy_kwargs = dict(net_arch=[8], selector=FixedSelector(selected))
+    model = filled_model(target_policy_noise=noise_std, policy_kwargs=policy_kwargs)
+    asked = []
+    model.critic_target.q_networks[0].register_forward_pre_hook(lambda module, inputs: asked.append(inputs[0][:, 3:]))
+    model.train(gradient_steps=1, batch_size=100_000)
+    (actions,) = asked
+    noise = actions - selected
+    if noise_std == 0.0:
+        assert noise.abs().max() == 0.0
+    elif selected == 0.0:
+        assert noise.abs().max().item() == pytest.approx(0.5)
+        # P(|N(0, 0.2)| > 0.5) = P(|N(0, 1)| > 2.5) = 0.0124
+        assert (noise.abs() == 0.5).float().mean().item() == pytest.approx(0.0124, abs=0.002)
+        assert noise.std().item() == pytest.approx(0.198, abs=0.004)
+    else:
+        assert actions.max().item() == 1.0
 
 
 def test_averages_follow_every_second_gradient_step():
@@ -158,7 +179,9 @@ def test_actor_losses_are_those_of_the_paper():
             values = [q_value(model, model.critic, s, a).item() for s, a in zip(observations, actions, strict=True)]
             expected = -np.mean(values)
         before = [parameter.clone() for parameter in model.critic.parameters()]
-        assert model._train_actor(observations) == pytest.approx(expected, rel=1e-4)
+        assert POLICY_LOSSES[policy_loss](model.policy, observations).item() == pytest.approx(expected, rel=1e-4)
+        losses, batch = losses_of_one_step(model)
+        assert losses["actor"] == pytest.approx(POLICY_LOSSES[policy_loss](model.policy, batch.observations).item())
         assert all(th.equal(a, b) for a, b in zip(before, model.critic.parameters(), strict=True))
 
 
@@ -292,7 +315,7 @@ def test_training_logs_what_the_documentation_explains(variant, trains_actor):
         "train/actor_learning_rate",
         "train/critic_loss",
         "train/q_value",
-        "train/cem_spread",
+        "train/cem_std",
         "train/saturated_actions",
     }
     assert set(values) == (always | of_the_actor if trains_actor else always)
@@ -308,7 +331,7 @@ def test_diagnostics_measure_what_they_say():
         q_cem = model.critic.q1_forward(observations, th.full((16, 1), 0.995))
         q_actor = model.critic.q1_forward(observations, actions)
     assert values["train/saturated_actions"] == 1.0
-    assert values["train/cem_spread"] == 0.0
+    assert values["train/cem_std"] == 0.0
     assert values["train/actor_cem_distance"] == pytest.approx(F.mse_loss(actions, th.full((16, 1), 0.995)).item() ** 0.5)
     assert values["train/cem_q_advantage"] == pytest.approx((q_cem - q_actor).mean().item(), abs=1e-6)
 

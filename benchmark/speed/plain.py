@@ -8,7 +8,7 @@ from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_cgp.core.cem import Selection
 from sb3_cgp.core.policies import CGPPolicy
-from sb3_cgp.fast.scoring import repeated_q_score
+from sb3_cgp.core.policies import repeated_q_score
 
 
 class PlainPolicy(CGPPolicy):

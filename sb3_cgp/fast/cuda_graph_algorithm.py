@@ -1,111 +1,90 @@
-"""Off-policy algorithms whose gradient steps are watched for NaN, and are CUDA graphs on a GPU."""
+"""CGP whose gradient steps, and whose acting by CEM, are CUDA graphs on a GPU."""
 
-from typing import Any, NamedTuple
+from collections import defaultdict
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.td3.policies import Actor
 
-from sb3_cgp.core.policies import CGPPolicy
-from sb3_cgp.fast.cuda_graphs import (
-    Captured,
-    LossWatch,
-    can_capture,
-    is_fused_adam,
-    set_capturable,
-    set_learning_rate,
-    skip_step_if,
+from sb3_cgp.common.rules import require
+from sb3_cgp.core.cgp import CGP
+from sb3_cgp.fast.cuda_graphs import RecordedFunction, Tensors, has_cuda_graphs
+from sb3_cgp.fast.recorded_optimizers import LossWatch, is_fused_adam, set_capturable, skip_step_if
+
+SelfCudaGraphAlgorithm = TypeVar("SelfCudaGraphAlgorithm", bound="CudaGraphAlgorithm")
+
+# Keys of the losses in the log, in the order in which a recorded step returns them
+LOSSES = ("critic_loss", "q_value", "actor_loss")
+# Attributes that hold graphs or tensors on the device, and are made anew for a copied or loaded model
+TRANSIENT = (
+    "_records_steps",
+    "_recorded_rates",
+    "_recorded",
+    "_recorded_settings",
+    "_loss_watch",
+    "_unlogged",
+    "_step_losses",
 )
-from sb3_cgp.fast.replay import LeanReplayAlgorithm
 
 
-class StepLosses(NamedTuple):
+class _OneBatch:
     """
-    What a gradient step found, as scalars on the device.
+    A replay buffer whose every sample is one given minibatch.
 
-    :param critic: the critics' loss
-    :param q_value: the first critic's mean value
-    :param actor: the actor's loss; None where it was not its turn
+    :param batch: the minibatch
     """
 
-    critic: th.Tensor
-    q_value: th.Tensor
-    actor: th.Tensor | None
+    def __init__(self, batch: ReplayBufferSamples):
+        self._batch = batch
+
+    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
+        """Return the minibatch."""
+        return self._batch
 
 
-class GradientAlgorithm(LeanReplayAlgorithm):
+class CudaGraphAlgorithm(CGP):
     """
-    An algorithm that says what a gradient step is, and has it carried out here.
+    CGP whose gradient steps are recorded as CUDA graphs on a GPU, and replayed.
 
-    On a GPU, where ``cuda_graphs`` says so, a step is recorded as a CUDA graph and replayed: what it finds is read only when
-    it is logged. Elsewhere it is carried out as it stands.
+    The recorded function is the core's ``train`` itself, for one gradient step on a minibatch that was sampled before. Its
+    losses are read when the log is written, as the host would synchronize with the GPU at every step otherwise; a NaN or
+    infinite loss lets the optimizer skip the step, and is reported at that time. Without a GPU, and with ``Dict``
+    observations or another optimizer than a fused Adam, steps are carried out as usual.
     """
 
-    policy: CGPPolicy
-    actor: Actor
-    critic: ContinuousCritic
+    # The argument of the constructor
+    cuda_graphs: bool = True
 
-    def _gradient_step(self, batch: ReplayBufferSamples, *turns: bool) -> StepLosses:
-        """
-        Do one gradient step.
+    def _setup_model(self) -> None:
+        require(isinstance(self.cuda_graphs, bool), "cuda_graphs", self.cuda_graphs, "True or False")
+        super()._setup_model()
+        self._prepare_graphs()
 
-        :param batch: a minibatch
-        :param turns: what is due in this step, for the algorithm to tell
-        :return: the losses
-        """
-        raise NotImplementedError
-
-    def _fixed_in_graphs(self) -> tuple[Any, ...]:
-        """List the settings that a graph fixes when it is recorded, and that a callback may change."""
-        raise NotImplementedError
-
-    def _prepare_capture(self) -> None:
-        """Settle whether gradient steps are recorded as CUDA graphs, and forget those there are."""
+    def _prepare_graphs(self) -> None:
+        """Decide whether gradient steps are recorded, and discard the present graphs."""
         optimizers = (self.actor.optimizer, self.critic.optimizer)
-        self._is_captured = (
+        self._records_steps = (
             self.cuda_graphs
-            and can_capture(self.device)
+            and has_cuda_graphs(self.device)
             and isinstance(self.observation_space, spaces.Box)
             and all(map(is_fused_adam, optimizers))
         )
-        self._captured_rates: dict[th.optim.Optimizer, th.Tensor] = {}
-        for optimizer in optimizers:
-            if self._is_captured:
-                self._captured_rates[optimizer] = th.tensor(float(optimizer.param_groups[0]["lr"]), device=self.device)
-            set_capturable(optimizer, self._captured_rates.get(optimizer))
-        # By what is due in a gradient step; None for acting
-        self._captures: dict[tuple[bool, ...] | None, Captured] = {}
-        self._captured_settings: tuple[Any, ...] = ()
+        # Tensors from which graphs read the learning rates
+        self._recorded_rates: dict[str, th.Tensor] = {}
+        for name, optimizer in zip(("actor", "critic"), optimizers, strict=True):
+            if self._records_steps:
+                self._recorded_rates[name] = th.tensor(float(optimizer.param_groups[0]["lr"]), device=self.device)
+            set_capturable(optimizer, self._recorded_rates.get(name))
+        # By (trains the actor, moves the averages); None for acting
+        self._recorded: dict[tuple[bool, bool] | None, RecordedFunction] = {}
+        self._recorded_settings: tuple[Any, ...] = ()
         self._loss_watch = LossWatch(("critic", "actor"), self._n_updates, self.device)
-        self._unlogged_losses: dict[str, list[th.Tensor]] = {}
-
-    def _capture(self, turns: tuple[bool, ...] | None) -> Captured:
-        """Find the capture of a gradient step or of acting, a new one if a setting has changed."""
-        settings = self._fixed_in_graphs()
-        if settings != self._captured_settings:
-            self._captures.clear()
-            self._captured_settings = settings
-        if turns not in self._captures:
-            # Selecting actions changes nothing
-            self._captures[turns] = Captured() if turns is None else Captured(self._list_state)
-        return self._captures[turns]
-
-    def _list_state(self) -> list[th.Tensor]:
-        """List the tensors that a gradient step changes in place."""
-        moments = [
-            value
-            for optimizer in (self.actor.optimizer, self.critic.optimizer)
-            for state in optimizer.state.values()
-            for value in state.values()
-        ]
-        return [*self.policy.parameters(), *self.policy.buffers(), *moments, *self._loss_watch.state]
-
-    def _select_actions(self, observation: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        """Select actions for acting while training, as a CUDA graph."""
-        return self._capture(None)(lambda observation: self.policy.select_actions(observation, self.critic), observation)
+        self._unlogged: dict[str, list[th.Tensor]] = {}
+        # The losses of the step that is carried out, within `_carry_out`
+        self._step_losses: dict[str, list[th.Tensor]] | None = None
 
     def set_parameters(
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
@@ -120,82 +99,169 @@ class GradientAlgorithm(LeanReplayAlgorithm):
         :param device: Device on which the code should run.
         """
         super().set_parameters(load_path_or_dict, exact_match, device)
-        # The optimisers' state lies elsewhere in memory now
-        self._prepare_capture()
+        # The optimizers' state is in other memory now
+        self._prepare_graphs()
 
-    def _step_on(self, batch: ReplayBufferSamples, *turns: bool) -> StepLosses:
+    def train(self, gradient_steps: int, batch_size: int = 128) -> None:
         """
-        Carry a gradient step out, on a GPU as a CUDA graph.
+        Do gradient steps, as CUDA graphs where possible.
 
-        :param batch: a minibatch
-        :param turns: what is due in this step
-        :return: the losses
+        :param gradient_steps: number of gradient steps
+        :param batch_size: number of transitions in a minibatch
         """
-        if not self._is_captured:
-            return self._gradient_step(batch, *turns)
+        if not self._records_steps:
+            super().train(gradient_steps, batch_size)
+            return
+        assert self.replay_buffer is not None
+        self.policy.set_training_mode(True)
+        self._update_learning_rates(self._current_progress_remaining, "critic", "actor")
+        losses = defaultdict(list)
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            n_updates = self._n_updates + 1
+            trains_actor = self._trains_online and n_updates % self.policy_delay == 0
+            moves_averages = n_updates % self.target_update_interval == 0
+            results = self._recorded_function((trains_actor, moves_averages))(self._carry_out, *batch)
+            self._n_updates = n_updates
+            for name, loss in zip(LOSSES, results, strict=True):
+                if loss is not None:
+                    losses[name].append(loss)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self._unlogged.update(losses)
 
-        def step(*fields: th.Tensor) -> StepLosses:
-            self._loss_watch.begin_step()
-            return self._gradient_step(ReplayBufferSamples(*fields), *turns)
+    def _carry_out(self, *fields: th.Tensor) -> Tensors:
+        """Run the core's ``train`` for one gradient step on a minibatch, and return its losses."""
+        self._loss_watch.begin_step()
+        # Neither is changed when a graph is replayed
+        usual = self.replay_buffer, self._n_updates
+        self.replay_buffer = _OneBatch(ReplayBufferSamples(*fields))  # type: ignore[assignment]
+        losses = self._step_losses = {}
+        try:
+            super().train(1)
+        finally:
+            self.replay_buffer, self._n_updates = usual
+            self._step_losses = None
+        return tuple(losses[name][0] if name in losses else None for name in LOSSES)
 
-        return StepLosses(*self._capture(turns)(step, *batch))  # type: ignore[arg-type]
+    def _recorded_function(self, due: tuple[bool, bool] | None) -> RecordedFunction:
+        """Return the recorded function of a gradient step or of acting; a new one if a setting has changed."""
+        selector = self.policy.selector
+        noise = (self.target_policy_noise, self.target_noise_clip)
+        dtype = getattr(self.policy, "cem_dtype", None)
+        # What a graph fixes when it is recorded, and a callback may change
+        settings = (self.gamma, self.tau, *noise, self.policy_loss, dtype, selector, repr(selector))
+        if settings != self._recorded_settings:
+            self._recorded.clear()
+            self._recorded_settings = settings
+        if due not in self._recorded:
+            # Selecting actions changes no tensor
+            self._recorded[due] = RecordedFunction() if due is None else RecordedFunction(self._list_state)
+        return self._recorded[due]
 
-    def _descend(self, optimizer: th.optim.Optimizer, loss: th.Tensor, name: str) -> th.Tensor:
+    def _list_state(self) -> list[th.Tensor]:
+        """Return the tensors that a gradient step changes in place."""
+        moments = [
+            value
+            for optimizer in (self.actor.optimizer, self.critic.optimizer)
+            for state in optimizer.state.values()
+            for value in state.values()
+        ]
+        return [*self.policy.parameters(), *self.policy.buffers(), *moments, *self._loss_watch.state]
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if not self._records_steps:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        self.policy.recorded_selection = self._select_actions  # type: ignore[assignment]
+        try:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        finally:
+            self.policy.recorded_selection = None  # type: ignore[assignment]
+
+    def _select_actions(self, observation: th.Tensor) -> Tensors:
+        """Select actions in rollouts, as a CUDA graph."""
+        return self._recorded_function(None)(
+            lambda observation: self.policy.select_actions(observation, self.critic), observation
+        )
+
+    def _update_learning_rates(self, progress_remaining: float, *names: str) -> None:
+        if self._step_losses is not None:
+            # Within a step, which would record the present rates: the host has set them before
+            return
+        super()._update_learning_rates(progress_remaining, *names)
+        for name in self._recorded_rates.keys() & set(names):
+            for group in getattr(self, name).optimizer.param_groups:
+                # SB3 has put a number in the place of the tensor that graphs read
+                self._recorded_rates[name].fill_(group["lr"])
+                group["lr"] = self._recorded_rates[name]
+
+    def _descend(self, name: str, loss: th.Tensor) -> None:
+        if not self._records_steps:
+            super()._descend(name, loss)
+            return
+        skip_step_if(getattr(self, name).optimizer, self._loss_watch.see(name, loss))
+        # The core's own: a guard in between would read the loss on the host
+        CGP._descend(self, name, loss)
+
+    def _record_losses(self, losses: dict[str, list[th.Tensor]]) -> None:
+        if self._step_losses is not None:
+            self._step_losses.update(losses)
+            return
+        self._report()
+        super()._record_losses(losses)
+
+    def _report(self) -> None:
         """
-        Take one step down a loss, unless it is NaN or infinite.
+        Log the losses of recorded steps, for which the host synchronizes with the GPU.
 
-        :param optimizer: the network's optimiser
-        :param loss: the loss, a scalar
-        :param name: the network's name, for the error
-        :return: the loss, a scalar without gradient
-        :raises ValueError: if the loss is NaN or infinite; where steps are captured, :class:`LossWatch` raises it later
+        :raises ValueError: if a loss was NaN or infinite
         """
-        if self._is_captured:
-            skip_step_if(optimizer, self._loss_watch.see(name, loss))
-        elif not np.isfinite(loss.item()):
-            raise ValueError(
-                f"The {name} loss is {loss.item()} at gradient step {self._n_updates}, environment step {self.num_timesteps}. "
-                f"The {name} is as before that step."
-            )
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        return loss.detach()
-
-    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
-        # SB3's would put a number in a captured tensor's place
-        rate = self.lr_schedule(self._current_progress_remaining)
-        self.logger.record("train/learning_rate", rate)
-        for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
-            set_learning_rate(optimizer, rate, self._captured_rates.get(optimizer))
-
-    def _record_losses(self, losses: list[StepLosses]) -> None:
-        """Log the means over some gradient steps; on a GPU when the log is written, as the host would have to wait for it."""
-        for key, values in zip(
-            ("train/critic_loss", "train/q_value", "train/actor_loss"), zip(*losses, strict=True), strict=False
-        ):
-            present = [value for value in values if value is not None]
-            if len(present) > 0:
-                self._unlogged_losses[key] = present
-        if not self._is_captured:
-            self._log_losses()
-
-    def _log_losses(self) -> None:
-        for key, values in self._unlogged_losses.items():
-            self.logger.record(key, th.stack(values).mean().item())
-        self._unlogged_losses.clear()
+        if self._records_steps:
+            self._loss_watch.check()
+            unlogged, self._unlogged = self._unlogged, {}
+            super()._record_losses(unlogged)
 
     def dump_logs(self) -> None:
         """
         Write log data.
 
-        :raises ValueError: if a loss was NaN or infinite in a captured gradient step
+        :raises ValueError: if a loss was NaN or infinite in a recorded gradient step
         """
-        if self._is_captured:
-            self._loss_watch.check()
-            self._log_losses()
+        self._report()
         super().dump_logs()
 
+    def learn(self: SelfCudaGraphAlgorithm, *args: Any, **kwargs: Any) -> SelfCudaGraphAlgorithm:
+        """
+        Learn as the core does.
+
+        :param args: the core's arguments
+        :param kwargs: the core's arguments
+        :return: the trained model
+        :raises ValueError: if a loss was NaN or infinite
+        """
+        super().learn(*args, **kwargs)
+        if self._records_steps:
+            self._loss_watch.check()
+        return self
+
+    def get_training_state(self) -> dict[str, Any]:
+        """
+        Return nothing further, but report first: a state saved now has the losses in its log, and no NaN unreported.
+
+        :return: the training state of the other parts of the model
+        :raises ValueError: if a loss was NaN or infinite in a recorded gradient step
+        """
+        self._report()
+        parent = getattr(super(), "get_training_state", dict)
+        return parent()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in TRANSIENT}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._prepare_graphs()
+
     def _excluded_save_params(self) -> list[str]:
-        captured = ["_is_captured", "_captured_rates", "_captures", "_captured_settings", "_loss_watch", "_unlogged_losses"]
-        return [*super()._excluded_save_params(), *captured]
+        return [*super()._excluded_save_params(), *TRANSIENT]

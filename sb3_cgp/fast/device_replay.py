@@ -1,4 +1,4 @@
-"""A replay buffer that lives where the networks do: a gradient step then takes nothing but row numbers from the host."""
+"""A replay buffer on the networks' device: a gradient step then copies nothing but row numbers from the host."""
 
 from typing import Any
 
@@ -10,14 +10,14 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_cgp.common.rules import require
-from sb3_cgp.fast.cuda_graphs import can_capture
+from sb3_cgp.fast.cuda_graphs import has_cuda_graphs
 
 
 def fits_device(
     buffer_class: type[ReplayBuffer], observation_space: spaces.Space, optimize_memory_usage: bool, device: th.device
 ) -> bool:
     """
-    Tell whether a :class:`DeviceReplayBuffer` does all that the buffer does whose place it is to take.
+    Return whether a :class:`DeviceReplayBuffer` can replace a replay buffer.
 
     :param buffer_class: the model's replay buffer class; SB3 has a class of its own for n-step returns
     :param observation_space: observation space
@@ -26,17 +26,17 @@ def fits_device(
     :return: True for SB3's default class with ``Box`` observations on a GPU that has CUDA graphs
     """
     is_plain = buffer_class is ReplayBuffer and isinstance(observation_space, spaces.Box) and not optimize_memory_usage
-    return is_plain and can_capture(device)
+    return is_plain and has_cuda_graphs(device)
 
 
 def leaves_room(observation_space: spaces.Space, buffer_size: int, device: th.device) -> bool:
     """
-    Tell whether a :class:`DeviceReplayBuffer` leaves memory for networks, graphs and others' work.
+    Return whether a :class:`DeviceReplayBuffer` leaves enough of the GPU's memory free.
 
     :param observation_space: observation space, a ``Box``
     :param buffer_size: number of transitions
     :param device: a GPU
-    :return: whether its observations, by far the most of it, take at most half of what is free
+    :return: whether its observations, by far the largest part, take at most half of the free memory
     """
     assert isinstance(observation_space, spaces.Box)
     # Floating point numbers are stored in float32 at most
@@ -46,7 +46,7 @@ def leaves_room(observation_space: spaces.Space, buffer_size: int, device: th.de
 
 
 def _stored(name: str) -> Any:
-    """Make a property of one field of all rows, a tensor that may be written to."""
+    """Return a property for one field of all rows, a tensor that shares the storage."""
     return property(lambda self: self._view(self._rows, name))
 
 
@@ -62,10 +62,10 @@ class DeviceReplayBuffer(ReplayBuffer):
     :param action_space: Action space
     :param device: PyTorch device
     :param n_envs: Number of parallel environments
-    :param optimize_memory_usage: must be False: the memory efficient variant is SB3's alone
+    :param optimize_memory_usage: must be False, as this buffer has no memory efficient variant
     :param handle_timeout_termination: Handle timeout termination (due to timelimit)
         separately and treat the task as infinite horizon task.
-    :raises ValueError: if ``optimize_memory_usage`` is set or the observation space is no ``Box``
+    :raises ValueError: if ``optimize_memory_usage`` is set or the observation space is not a ``Box``
     """
 
     observations = _stored("observations")
@@ -89,9 +89,9 @@ class DeviceReplayBuffer(ReplayBuffer):
         require(is_box, "observation_space", observation_space, "a Box for a DeviceReplayBuffer")
         allowed = "False for a DeviceReplayBuffer"
         require(not optimize_memory_usage, "optimize_memory_usage", optimize_memory_usage, allowed)
-        # What SB3's assignment to `device` moves
+        # SB3 assigns `device` in the constructor below, which moves this tensor
         self._rows = th.empty(0)
-        # Not ReplayBuffer's constructor, which allocates the arrays on the host
+        # ReplayBuffer's constructor would allocate the arrays on the host
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
         self.buffer_size = max(buffer_size // n_envs, 1)
         self.optimize_memory_usage = False
@@ -122,7 +122,7 @@ class DeviceReplayBuffer(ReplayBuffer):
 
     def _view(self, rows: th.Tensor, name: str) -> th.Tensor:
         """
-        Read one field out of rows.
+        Return one field of rows.
 
         :param rows: transitions as bytes (..., bytes of a row)
         :param name: the field's name
@@ -149,8 +149,8 @@ class DeviceReplayBuffer(ReplayBuffer):
         :param next_obs: next observations (n_envs, *observation shape)
         :param action: actions (n_envs, *action shape)
         :param reward: rewards (n_envs,)
-        :param done: whether the episodes end (n_envs,)
-        :param infos: the environments' information, which tells a timeout
+        :param done: whether the episodes ended (n_envs,)
+        :param infos: the environments' information, with the key ``TimeLimit.truncated`` at a timeout
         """
         row = np.zeros(self.n_envs, self._row_dtype)
         row["observations"] = obs
@@ -160,7 +160,7 @@ class DeviceReplayBuffer(ReplayBuffer):
         row["dones"] = done
         if self.handle_timeout_termination:
             row["timeouts"] = [info.get("TimeLimit.truncated", False) for info in infos]
-        # CUDA has read pageable memory when it returns, and need not wait for the work before
+        # The call returns when pageable memory has been read, and does not synchronize with earlier work
         self._rows[self.pos].copy_(th.from_numpy(row.view(np.uint8).reshape(self.n_envs, -1)), non_blocking=True)
         self.pos += 1
         if self.pos == self.buffer_size:
@@ -168,11 +168,11 @@ class DeviceReplayBuffer(ReplayBuffer):
             self.pos = 0
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        # SB3's random numbers, from its generator
+        # The same random numbers as SB3's buffer
         env_indices = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))  # noqa: NPY002
         indices = np.ravel_multi_index((batch_inds, env_indices), (self.buffer_size, self.n_envs))
         rows = self._rows.flatten(0, 1)[th.from_numpy(indices).to(self.device, non_blocking=True)]
-        # Of the memory layout that SB3's have, as products may be rounded differently for another one
+        # In the memory layout of SB3's samples, as products may be rounded differently in another layout
         observations = self._view(rows, "observations").contiguous()
         next_observations = self._view(rows, "next_observations").contiguous()
         actions = self._view(rows, "actions").contiguous()
@@ -194,6 +194,6 @@ class DeviceReplayBuffer(ReplayBuffer):
     def __setstate__(self, state: dict[str, Any]) -> None:
         device = state.pop("device")
         self.__dict__.update(state, _rows=th.from_numpy(state["_rows"]))
-        # Only a model that loads the buffer sets its own device afterwards
+        # A model that loads the buffer sets its own device afterwards
         if device.type != "cuda" or device.index < th.cuda.device_count():
             self.device = device

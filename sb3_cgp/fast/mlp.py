@@ -1,4 +1,4 @@
-"""Multilayer perceptrons that are trained in fewer and faster operations on a CPU."""
+"""Multilayer perceptrons whose training takes fewer and faster operations on a CPU."""
 
 from typing import Any
 
@@ -6,54 +6,54 @@ import torch as th
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from sb3_cgp.fast.linear import multiply, rectified_layers
+from sb3_cgp.fast.linear import leading_relu_layers, multiply
 
-# Rows from which on there is something to gain
+# Number of rows from which on the own operations are faster than PyTorch's
 MANY_ROWS = 32
 
 
-class Perceptron(nn.Sequential):
+class MLP(nn.Sequential):
     """
-    A sequence of modules that computes itself what linear layers with rectifiers between them do at its beginning.
+    A sequence of modules whose leading linear layers, with ReLU between them, are one autograd function.
 
-    It does so for batches of float32 on a CPU, where it can; elsewhere it is PyTorch's sequence. Such a batch has no second
-    derivatives, nor does ``torch.func`` know its gradient.
+    The function is used for float32 batches on a CPU. Everywhere else the modules are called one by one, as PyTorch does.
+    The function has no second derivatives, and ``torch.func`` does not support it.
     """
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
         """
-        Pass a batch through all modules.
+        Compute the outputs of a batch.
 
         :param inputs: the batch, (rows, inputs)
         :return: the outputs, (rows, outputs)
         """
-        layers = rectified_layers(self) if _is_for_us(inputs) else []
+        layers = leading_relu_layers(self) if _is_supported(inputs) else []
         if not layers:
             return super().forward(inputs)
         parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
-        outputs = _Layers.apply(inputs, *parameters)
+        outputs = _ReLULayers.apply(inputs, *parameters)
         for module in list(self)[2 * len(layers) - 1 :]:
             outputs = module(outputs)
         return outputs
 
 
-def _is_for_us(inputs: th.Tensor) -> bool:
-    # What is traced is to be computed elsewhere
+def _is_supported(inputs: th.Tensor) -> bool:
+    # A traced or compiled network shall consist of PyTorch's operators
     if th.jit.is_tracing() or th.compiler.is_compiling() or th.is_autocast_enabled("cpu"):
         return False
     is_batch = inputs.dim() == 2 and inputs.shape[0] >= MANY_ROWS
     return is_batch and inputs.device.type == "cpu" and inputs.dtype == th.float32
 
 
-class _Layers(th.autograd.Function):
-    """Linear layers with rectifiers between them; autograd's own gradient asks MKL, which is slow on AMD's processors."""
+class _ReLULayers(th.autograd.Function):
+    """Linear layers with ReLU between them. PyTorch's own gradient calls MKL, which is slow on AMD's processors."""
 
     @staticmethod
     def forward(ctx: Any, inputs: th.Tensor, *parameters: th.Tensor) -> th.Tensor:
         """
-        Pass a batch through the layers.
+        Compute the outputs of a batch.
 
-        :param ctx: keeps what the gradient needs
+        :param ctx: autograd's context, which keeps the activations for the gradient
         :param inputs: the batch, (rows, inputs)
         :param parameters: the first layer's weight, its bias, the second layer's weight, ...
         :return: the outputs, (rows, outputs)
@@ -69,9 +69,9 @@ class _Layers(th.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:
         """
-        Pass a gradient back.
+        Compute the gradients by the inputs and the parameters.
 
-        :param ctx: what ``forward`` kept
+        :param ctx: autograd's context, with the activations of ``forward``
         :param gradient: the gradient by the outputs, (rows, outputs)
         :return: the gradients by the inputs and by the parameters; None where none is needed
         """

@@ -1,4 +1,4 @@
-"""Off-policy algorithms that take no more memory for their replay buffer than they need, and the GPU's if it has it."""
+"""Off-policy algorithms whose replay buffer takes no more memory than needed, and lies on the GPU where that is faster."""
 
 import io
 import pathlib
@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
@@ -20,10 +20,10 @@ SelfLeanReplayAlgorithm = TypeVar("SelfLeanReplayAlgorithm", bound="LeanReplayAl
 
 def float32_space(space: spaces.Space) -> spaces.Space:
     """
-    Narrow a space's floating point numbers to float32, which the networks compute in.
+    Return a space whose floating-point numbers are float32, in which the networks compute.
 
     :param space: an observation space
-    :return: the same space with float32 where it had more; other types stay as they are
+    :return: the same space with float32 in place of wider floating-point types; other types do not change
     """
     if isinstance(space, spaces.Dict):
         return spaces.Dict({key: float32_space(subspace) for key, subspace in space.items()})
@@ -36,61 +36,61 @@ def float32_space(space: spaces.Space) -> spaces.Space:
 
 class LeanReplayAlgorithm(OffPolicyAlgorithm):
     """
-    SB3's off-policy algorithm, save for its replay buffer, of whichever class it is.
+    SB3's off-policy algorithm with a lean replay buffer, of any class.
 
-    Observations are stored in float32 at most, as the networks compute in it: half the memory for MuJoCo's float64.
-    A model that is loaded to be watched takes no memory for a million transitions. rl_zoo3's ``enjoy`` and
-    ``record_video`` see to that themselves, but only for a fixed list of algorithms.
+    Observations are stored in float32 at most, as the networks compute in it, which halves the memory for MuJoCo's float64.
+    Observations that ``VecNormalize`` normalises are stored as they are: their difference from the mean, which the networks
+    see, may be smaller than float32's resolution.
+
+    A loaded model allocates its replay buffer when it learns. rl_zoo3's ``enjoy`` and ``record_video`` avoid the memory of a
+    million transitions too, but only for a fixed list of algorithms.
     """
 
-    # An argument of the algorithm's: the buffer lies on the GPU to be of use to them
+    # An argument of the CUDA-graph algorithm, which also decides where the buffer lies
     cuda_graphs: bool = True
     # Set by `load`, before the model is built
-    _replay_buffer_deferred: bool = False
+    _defers_replay_buffer: bool = False
 
     def _setup_model(self) -> None:
-        # SB3 allocates a buffer here that is not ours: one row of it
-        buffer_size, self.buffer_size = self.buffer_size, 1
+        # SB3 stores its choices in the arguments, where they would outrank the arguments of a later `load`
+        given = self.replay_buffer_class, self.replay_buffer_kwargs
+        self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs)
+        # SB3 allocates a buffer unless there is one, and asks for an environment to do so for hindsight replay
+        self.replay_buffer = ReplayBuffer.__new__(ReplayBuffer)
         super()._setup_model()
-        self.buffer_size, self.replay_buffer = buffer_size, None
-        if not self._replay_buffer_deferred:
+        self._buffer_class, self.replay_buffer = self.replay_buffer_class, None
+        self.replay_buffer_class, self.replay_buffer_kwargs = given
+        if not self._defers_replay_buffer:
             self._ensure_replay_buffer()
 
     def _ensure_replay_buffer(self) -> ReplayBuffer:
-        """
-        Allocate the replay buffer if there is none: as SB3 does it, or on the GPU.
-
-        The class is chosen here and not remembered, as a model may be loaded on another device than it was saved from.
-
-        :return: the replay buffer
-        """
-        if self.replay_buffer is not None:
-            return self.replay_buffer
-        assert self.replay_buffer_class is not None
-        arguments = (self.replay_buffer_class, self.observation_space, self.optimize_memory_usage, self.device)
-        buffer_class = self.replay_buffer_class
-        if self.cuda_graphs and fits_device(*arguments):
-            if leaves_room(self.observation_space, self.buffer_size, self.device):
-                buffer_class = DeviceReplayBuffer
-            else:
-                message = f"A replay buffer of {self.buffer_size} takes over half of {self.device}'s free memory"
-                warnings.warn(f"{message}: it is kept on the host.", stacklevel=2)
-        self.replay_buffer = self._allocate(buffer_class)
+        """Return the replay buffer, allocated now if there is none."""
+        if self.replay_buffer is None:
+            self.replay_buffer = self._allocate(self._choose_buffer_class())
         return self.replay_buffer
 
-    def _allocate(self, buffer_class: type[ReplayBuffer]) -> ReplayBuffer:
-        """
-        Make an empty replay buffer.
+    def _choose_buffer_class(self) -> type[ReplayBuffer]:
+        """Return the class of the buffer. A model may be loaded on another device, so that the choice is not stored."""
+        assert self._buffer_class is not None
+        choice = (self._buffer_class, self.observation_space, self.optimize_memory_usage, self.device)
+        if not self.cuda_graphs or not fits_device(*choice):
+            return self._buffer_class
+        if leaves_room(self.observation_space, self.buffer_size, self.device):
+            return DeviceReplayBuffer
+        message = f"A replay buffer of {self.buffer_size} takes over half of {self.device}'s free memory"
+        warnings.warn(f"{message}: it is kept on the host.", stacklevel=2)
+        return self._buffer_class
 
-        :param buffer_class: its class
-        :return: the replay buffer
-        """
+    def _allocate(self, buffer_class: type[ReplayBuffer]) -> ReplayBuffer:
+        """Return an empty replay buffer of a class."""
         kwargs = self.replay_buffer_kwargs.copy()
         if issubclass(buffer_class, HerReplayBuffer):
             kwargs["env"] = self.env
+        if self._chooses_n_step_returns(buffer_class):
+            kwargs |= {"n_steps": self.n_steps, "gamma": self.gamma}
         return buffer_class(
             self.buffer_size,
-            float32_space(self.observation_space),
+            self._stored_space(),
             self.action_space,
             device=self.device,
             n_envs=self.n_envs,
@@ -98,8 +98,26 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
             **kwargs,
         )
 
+    def _stored_space(self) -> spaces.Space:
+        """Return the observation space with the data types in which observations are stored."""
+        normalizer = self.get_vec_normalize_env()
+        is_normalized = normalizer is not None and normalizer.norm_obs
+        return self.observation_space if is_normalized else float32_space(self.observation_space)
+
+    def _chooses_n_step_returns(self, buffer_class: type[ReplayBuffer]) -> bool:
+        """Return whether the model's ``n_steps`` and ``gamma`` are the buffer's, as where the user gave no class."""
+        return self.replay_buffer_class is None and issubclass(buffer_class, NStepReplayBuffer)
+
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
-        self._ensure_replay_buffer()
+        buffer = self._ensure_replay_buffer()
+        if buffer.size() == 0 and buffer.observation_space != self._stored_space():
+            # `set_env` has added or removed VecNormalize
+            self.replay_buffer = None
+            buffer = self._ensure_replay_buffer()
+        if self._chooses_n_step_returns(type(buffer)):
+            assert isinstance(buffer, NStepReplayBuffer)
+            # A loaded buffer has those of the model that saved it
+            buffer.n_steps, buffer.gamma = self.n_steps, self.gamma
         return super()._setup_learn(*args, **kwargs)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
@@ -124,23 +142,14 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         **kwargs: Any,
     ) -> SelfLeanReplayAlgorithm:
         """
-        Load the model from a zip-file, as SB3 does.
+        Load the model from a zip-file, as SB3 does, without a replay buffer until ``learn`` allocates it.
 
-        Its replay buffer is None until ``learn`` allocates it or ``load_replay_buffer`` loads one.
+        The parameters are those of SB3's ``load``.
 
-        :param path: path to the file (or a file-like) where to load the agent from
-        :param env: the new environment to run the loaded model on
-            (can be None if you only need prediction from a trained model) has priority over any saved environment
-        :param device: Device on which the code should run.
-        :param custom_objects: Dictionary of objects to replace upon loading.
-        :param print_system_info: Whether to print system info from the saved model and the current system info
-        :param force_reset: Force call to ``reset()`` before training to avoid unexpected behavior.
-        :param kwargs: arguments to change in the model when loading, such as ``cem_iterations=4``
         :return: new model instance with loaded parameters
-        :raises ValueError: if a changed argument is out of its range or contradicts another one
         """
-        kwargs["_replay_buffer_deferred"] = True
+        kwargs["_defers_replay_buffer"] = True
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_replay_buffer_deferred"]
+        return [*super()._excluded_save_params(), "_defers_replay_buffer", "_buffer_class"]

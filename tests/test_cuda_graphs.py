@@ -15,9 +15,9 @@ import torch as th
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_cgp import CEM, CGP
-from sb3_cgp.fast import cuda_graph_algorithm as gradient
-from sb3_cgp.fast import cuda_graphs as captured
-from sb3_cgp.fast.cuda_graphs import EAGER_CALLS, Captured, LossWatch
+from sb3_cgp.fast import cuda_graph_algorithm, cuda_graphs
+from sb3_cgp.fast.cuda_graphs import WARM_UP_CALLS, RecordedFunction
+from sb3_cgp.fast.recorded_optimizers import LossWatch
 
 needs_gpu = pytest.mark.usefixtures("gpu")
 # Learning rates are powers of two: a captured one is a float32
@@ -53,9 +53,9 @@ class StandIn:
 
     def __init__(self, function, inputs):
         StandIn.made += 1
-        self.function, self.inputs = function, captured._clones(inputs)
+        self.function, self.inputs = function, cuda_graphs.clone_all(inputs)
 
-    fits = captured.Recording.fits
+    fits = cuda_graphs.Recording.fits
 
     @property
     def _inputs(self):
@@ -65,14 +65,14 @@ class StandIn:
         for recorded, new in zip(self.inputs, inputs, strict=True):
             if recorded is not None:
                 recorded.copy_(new)
-        return captured._clones(self.function(*self.inputs))
+        return cuda_graphs.clone_all(self.function(*self.inputs))
 
 
 @pytest.fixture
 def stand_in(monkeypatch):
     """Capture on the CPU, by the stand-in."""
-    monkeypatch.setattr(gradient, "can_capture", lambda device: True)
-    monkeypatch.setattr(captured, "Recording", StandIn)
+    monkeypatch.setattr(cuda_graph_algorithm, "has_cuda_graphs", lambda device: True)
+    monkeypatch.setattr(cuda_graphs, "Recording", StandIn)
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
     monkeypatch.setattr(StandIn, "made", 0)
 
@@ -88,10 +88,10 @@ def parameters(model):
 @pytest.mark.parametrize("name", VARIANTS)
 def test_captured_training_is_eager_training(stand_in, name):
     taken = make_model(**VARIANTS[name]).learn(80)
-    assert taken._is_captured
+    assert taken._records_steps
     assert StandIn.made > 0
     eager = make_model(**VARIANTS[name], cuda_graphs=False).learn(80)
-    assert not eager._is_captured
+    assert not eager._records_steps
     assert taken._n_updates == eager._n_updates == 50
     assert th.equal(parameters(taken), parameters(eager))
 
@@ -105,30 +105,30 @@ def test_a_recording_that_does_something_else_is_noticed_and_not_used(stand_in, 
             outputs = self.function(*inputs)
             for _ in range(changes):
                 outputs = self.function(*inputs)
-            return captured._clones(outputs) if changes else tuple(None if each is None else 0 * each for each in outputs)
+            return cuda_graphs.clone_all(outputs) if changes else tuple(None if each is None else 0 * each for each in outputs)
 
     class Idle(Wrong):
         def replay(self, inputs):
             model_state = [tensor.clone() for tensor in self.state()]
             outputs = super().replay(inputs)
-            captured._restore(self.state(), model_state)
+            cuda_graphs.restore_all(self.state(), model_state)
             return outputs
 
     model = make_model(target_update_interval=1)
     Idle.state = staticmethod(model._list_state)
-    monkeypatch.setattr(captured, "Recording", Wrong if changes else Idle)
+    monkeypatch.setattr(cuda_graphs, "Recording", Wrong if changes else Idle)
     with pytest.warns(UserWarning, match="The CUDA graph of a step does not do what the step does"):
         model.learn(60)
-    assert all(capture._recording is None for turns, capture in model._captures.items() if turns is not None)
+    assert all(capture._recording is None for due, capture in model._recorded.items() if due is not None)
     assert model._n_updates == 30
     if changes == 0:
         # Acting, too, was found out; random numbers went on as if nothing had been recorded
         assert th.equal(parameters(model), parameters(make_model(target_update_interval=1, cuda_graphs=False).learn(60)))
 
 
-def test_every_combination_of_turns_is_recorded_once_and_acting_too(stand_in):
-    make_model(policy_delay=2, target_update_interval=3).learn(30 + 6 * (EAGER_CALLS + 5))
-    # Two by two turns, and the selection of actions
+def test_every_combination_of_what_is_due_is_recorded_once_and_acting_too(stand_in):
+    make_model(policy_delay=2, target_update_interval=3).learn(30 + 6 * (WARM_UP_CALLS + 5))
+    # Two by two combinations, and the selection of actions
     assert StandIn.made == 4 + 1
 
 
@@ -183,14 +183,14 @@ def test_parameters_that_are_set_are_trained_on(stand_in):
         made = StandIn.made
         model.learn(60, reset_num_timesteps=False)
         # What was recorded knows where the optimisers' state was, not where it is
-        assert (StandIn.made > made) == model._is_captured
+        assert (StandIn.made > made) == model._records_steps
     assert th.equal(*map(parameters, models))
 
 
-def test_a_captured_model_goes_on_where_nothing_is_captured(stand_in, tmp_path, monkeypatch):
+def test_a_captured_model_goes_on_where_nothing_records_steps(stand_in, tmp_path, monkeypatch):
     model = make_model().learn(60)
     model.save(tmp_path / "model")
-    monkeypatch.setattr(gradient, "can_capture", lambda device: False)
+    monkeypatch.setattr(cuda_graph_algorithm, "has_cuda_graphs", lambda device: False)
     loaded = CGP.load(tmp_path / "model", env=model.get_env())
     for optimizer in (loaded.actor.optimizer, loaded.critic.optimizer):
         (group,) = optimizer.param_groups
@@ -204,7 +204,7 @@ def test_losses_are_logged_when_the_log_is_written(stand_in):
     model = make_model(policy_delay=2).learn(99)
     assert "train/critic_loss" not in model.logger.name_to_value
     model.logger.dump = lambda step: None
-    critic_loss, actor_loss = (model._unlogged_losses[f"train/{name}_loss"] for name in ("critic", "actor"))
+    critic_loss, actor_loss = (model._unlogged[f"{name}_loss"] for name in ("critic", "actor"))
     # The actor's is from the step before
     model.dump_logs()
     recorded = model.logger.name_to_value
@@ -239,8 +239,8 @@ def test_a_nan_loss_ends_the_training_at_the_next_look_at_it(stand_in):
         model.learn(5, reset_num_timesteps=False)
 
 
-def test_what_makes_the_host_wait_is_carried_out_as_it_is(stand_in, monkeypatch):
-    monkeypatch.setattr(captured, "_rehearse", lambda function, inputs, gpu: (function(*inputs), True))
+def test_a_synchronizing_step_is_carried_out_as_it_is(stand_in, monkeypatch):
+    monkeypatch.setattr(cuda_graphs, "_warm_up", lambda function, inputs, gpu: (function(*inputs), True))
     model = make_model().learn(80)
     assert StandIn.made == 0
     assert th.equal(parameters(model), parameters(make_model(cuda_graphs=False).learn(80)))
@@ -251,7 +251,7 @@ def test_models_of_before_the_fused_adam_are_captured(stand_in):
     old.learn(60)
     model = make_model(seed=5)
     model.set_parameters(copy.deepcopy(old.get_parameters()))
-    assert model._is_captured
+    assert model._records_steps
     assert model.critic.optimizer.param_groups[0]["fused"] is True
     model.learn(60)
 
@@ -265,23 +265,23 @@ def test_models_of_before_the_fused_adam_are_captured(stand_in):
 )
 def test_other_optimisers_are_not_captured(stand_in, kwargs):
     model = make_model()
-    assert model._is_captured
-    assert not CGP("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[8]) | kwargs, **SMALL)._is_captured
+    assert model._records_steps
+    assert not CGP("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[8]) | kwargs, **SMALL)._records_steps
 
 
 def test_a_function_is_called_then_recorded_once_then_replayed(monkeypatch):
-    monkeypatch.setattr(captured, "Recording", StandIn)
+    monkeypatch.setattr(cuda_graphs, "Recording", StandIn)
     monkeypatch.setattr(StandIn, "made", 0)
 
     def double(tensor, nothing):
         return 2 * tensor, None
 
-    call = Captured()
-    for value in range(EAGER_CALLS + 3):
+    call = RecordedFunction()
+    for value in range(WARM_UP_CALLS + 3):
         doubled, nothing = call(double, th.full((2,), float(value)), None)
         assert doubled.tolist() == [2.0 * value] * 2
         assert nothing is None
-        assert StandIn.made == (value >= EAGER_CALLS)
+        assert StandIn.made == (value >= WARM_UP_CALLS)
     # Another shape or type than the recorded one
     assert call(double, th.ones(3), None)[0].tolist() == [2.0] * 3
     assert call(double, th.ones(2, dtype=th.long), None)[0].dtype == th.long
@@ -334,8 +334,8 @@ def make_believe_gpu(monkeypatch):
         streams["current"], found.is_recording = found.usual, False
 
     found = SimpleNamespace(streams=streams, usual=streams["current"], side=side, is_recording=False)
-    monkeypatch.setattr(captured, "_gpu_of", lambda inputs: th.device("cuda", 0))
-    monkeypatch.setattr(captured, "_side_stream", lambda gpu: side)
+    monkeypatch.setattr(cuda_graphs, "gpu_of", lambda inputs: th.device("cuda", 0))
+    monkeypatch.setattr(cuda_graphs, "_side_stream", lambda gpu: side)
     for name, replacement in {
         "device": lambda gpu: nullcontext(),
         "current_stream": lambda: streams["current"],
@@ -351,36 +351,36 @@ def make_believe_gpu(monkeypatch):
     return found
 
 
-def test_rehearsals_run_on_the_side_stream_in_order(make_believe_gpu):
+def test_warm_up_calls_run_on_the_side_stream_in_order(make_believe_gpu):
     seen = []
 
     def function(tensor):
         seen.append(make_believe_gpu.streams["current"].name)
         return (2 * tensor,)
 
-    outputs, waits = captured._rehearse(function, (th.ones(1),), th.device("cuda", 0))
+    outputs, waits = cuda_graphs._warm_up(function, (th.ones(1),), th.device("cuda", 0))
     assert (outputs[0].item(), waits, seen) == (2.0, False, ["side"])
     assert make_believe_gpu.side.waited_for == ["usual"]
     assert make_believe_gpu.usual.waited_for == ["side"]
 
 
-def test_a_host_that_waits_is_noticed_and_other_warnings_are_passed_on(make_believe_gpu):
+def test_a_synchronization_is_noticed_and_other_warnings_are_passed_on(make_believe_gpu):
     def function(tensor):
         warnings.warn("Synchronization debug mode is a prototype feature and may miss some", stacklevel=1)
         warnings.warn("called a synchronizing CUDA operation", stacklevel=1)
         warnings.warn("something else", stacklevel=1)
         return (tensor,)
 
-    call = Captured()
+    call = RecordedFunction()
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         call(function, th.ones(1))
     other, waiting = (str(warning.message) for warning in warned)
     assert other == "something else"
-    assert re.match("The host waits for the GPU in .*test_captured.py, line ", waiting)
+    assert re.match("The host synchronizes with the GPU in .*test_cuda_graphs.py, line ", waiting)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for _ in range(EAGER_CALLS):
+        for _ in range(WARM_UP_CALLS):
             call(function, th.ones(1))
     assert call._recording is None
 
@@ -392,7 +392,7 @@ def test_a_recording_is_made_on_the_side_stream(make_believe_gpu):
         seen.append(make_believe_gpu.streams["current"].name)
         return (2 * tensor,)
 
-    recording = captured.Recording(function, (th.ones(1), None))
+    recording = cuda_graphs.Recording(function, (th.ones(1), None))
     assert seen == ["side"]
     assert make_believe_gpu.streams["current"] is make_believe_gpu.usual
     assert recording.fits((th.zeros(1), None))
@@ -409,8 +409,8 @@ def test_what_cannot_be_recorded_is_carried_out(make_believe_gpu):
             raise RuntimeError("operation not permitted when stream is capturing\nSearch for it")
         return (2 * tensor,)
 
-    call = Captured()
-    for _ in range(EAGER_CALLS):
+    call = RecordedFunction()
+    for _ in range(WARM_UP_CALLS):
         call(function, th.ones(1))
     with pytest.warns(UserWarning, match="The reason: operation not permitted when stream is capturing$"):
         assert call(function, th.ones(1))[0].item() == 2.0
@@ -430,13 +430,13 @@ def test_graphs_train_as_eager_steps_do(monkeypatch, name):
         models = [
             make_model(**VARIANTS[name], device="cuda", cuda_graphs=cuda_graphs).learn(90) for cuda_graphs in (True, False)
         ]
-    assert [model._is_captured for model in models] == [True, False]
-    assert all(capture._recording is not None for capture in models[0]._captures.values())
+    assert [model._records_steps for model in models] == [True, False]
+    assert all(capture._recording is not None for capture in models[0]._recorded.values())
     th.testing.assert_close(*map(parameters, models), rtol=1e-3, atol=1e-4)
 
 
 @needs_gpu
-def test_a_selector_that_waits_for_the_gpu_is_not_recorded_and_works():
+def test_a_selector_that_synchronizes_is_not_recorded_and_works():
     class Waiting(CEM):
         def select(self, score, n_states, action_dim, device="cpu"):
             selection = super().select(score, n_states, action_dim, device)
@@ -444,10 +444,10 @@ def test_a_selector_that_waits_for_the_gpu_is_not_recorded_and_works():
             return selection
 
     model = CGP("MlpPolicy", "Pendulum-v1", device="cuda", policy_kwargs=dict(selector=Waiting(2, 8, 2)), **SMALL)
-    with pytest.warns(UserWarning, match="The host waits for the GPU in"):
+    with pytest.warns(UserWarning, match="The host synchronizes with the GPU in"):
         model.learn(60)
     assert model._n_updates == 30
-    assert all(capture._recording is None for capture in model._captures.values())
+    assert all(capture._recording is None for capture in model._recorded.values())
 
 
 @needs_gpu
@@ -481,8 +481,8 @@ def test_what_cannot_be_recorded_on_a_gpu_is_carried_out_and_spoils_nothing():
     before = make_model(device="cuda").learn(60)
     with pytest.warns(UserWarning, match="A step cannot be recorded as a CUDA graph, and is slower"):
         taken = train(cuda_graphs=True)[0]
-    assert any(capture._recording is None for capture in taken._captures.values())
+    assert any(capture._recording is None for capture in taken._recorded.values())
     th.testing.assert_close(parameters(taken), parameters(train(cuda_graphs=False)[0]), rtol=1e-3, atol=1e-4)
     for model in (before, make_model(device="cuda")):
         model.learn(60)
-        assert all(capture._recording is not None for capture in model._captures.values())
+        assert all(capture._recording is not None for capture in model._recorded.values())

@@ -1,4 +1,4 @@
-"""Perceptrons against PyTorch's own sequence of the same modules, values and gradients alike."""
+"""MLPs against PyTorch's own sequence of the same modules, values and gradients alike."""
 
 import copy
 
@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_cgp import CGP
 from sb3_cgp.fast import linear as products
-from sb3_cgp.fast.mlp import MANY_ROWS, Perceptron
+from sb3_cgp.fast.mlp import MANY_ROWS, MLP
 
 N_INPUTS = 11
 
@@ -29,8 +29,8 @@ NETWORKS = {
     "without bias": modules([160, 128], with_bias=False),
     "another activation": modules([16, 16], nn.Tanh),
     "batch norm": [nn.Linear(N_INPUTS, 8), nn.BatchNorm1d(8), nn.ReLU(), nn.Linear(8, 2)],
-    "two rectifiers": [nn.Linear(N_INPUTS, 8), nn.ReLU(), nn.ReLU(), nn.Linear(8, 2)],
-    "ends with a rectifier": [nn.Linear(N_INPUTS, 8), nn.ReLU()],
+    "two ReLU": [nn.Linear(N_INPUTS, 8), nn.ReLU(), nn.ReLU(), nn.Linear(8, 2)],
+    "ends with ReLU": [nn.Linear(N_INPUTS, 8), nn.ReLU()],
     "empty": [],
 }
 
@@ -49,7 +49,7 @@ def outcome(network, inputs):
 def test_values_and_gradients_are_those_of_the_sequence(monkeypatch, name, rows, with_onednn):
     # Or for all products, however small
     monkeypatch.setattr(products, "MANY_MULTIPLICATIONS", 1 if with_onednn else th.inf)
-    network = Perceptron(*copy.deepcopy(NETWORKS[name]))
+    network = MLP(*copy.deepcopy(NETWORKS[name]))
     # Batch norm takes no batch of one for training
     network.train(rows > 1)
     # In float64, by PyTorch alone
@@ -61,7 +61,7 @@ def test_values_and_gradients_are_those_of_the_sequence(monkeypatch, name, rows,
 
 
 def test_only_the_gradients_that_are_needed_are_given():
-    network = Perceptron(*copy.deepcopy(NETWORKS["wide"])).requires_grad_(False)
+    network = MLP(*copy.deepcopy(NETWORKS["wide"])).requires_grad_(False)
     network[2].weight.requires_grad_()
     inputs = th.randn(MANY_ROWS, N_INPUTS)
     network(inputs).sum().backward()
@@ -74,7 +74,7 @@ def test_only_the_gradients_that_are_needed_are_given():
 @pytest.mark.parametrize("kind", ["forward", "pre-forward", "backward", "pre-backward"])
 def test_hooks_are_called(kind):
     called = []
-    network = Perceptron(*copy.deepcopy(NETWORKS["wide"]))
+    network = MLP(*copy.deepcopy(NETWORKS["wide"]))
     register = {
         "forward": network[2].register_forward_hook,
         "pre-forward": network[2].register_forward_pre_hook,
@@ -87,7 +87,7 @@ def test_hooks_are_called(kind):
 
 
 def test_a_second_derivative_is_refused_rather_than_wrong():
-    network = Perceptron(*copy.deepcopy(NETWORKS["wide"]))
+    network = MLP(*copy.deepcopy(NETWORKS["wide"]))
     inputs = th.randn(MANY_ROWS, N_INPUTS, requires_grad=True)
     (gradient,) = th.autograd.grad(network(inputs).square().sum(), inputs, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
@@ -95,7 +95,7 @@ def test_a_second_derivative_is_refused_rather_than_wrong():
 
 
 def test_autocast_is_pytorchs():
-    network, inputs = Perceptron(*copy.deepcopy(NETWORKS["wide"])), th.randn(256, N_INPUTS)
+    network, inputs = MLP(*copy.deepcopy(NETWORKS["wide"])), th.randn(256, N_INPUTS)
     with th.autocast("cpu", dtype=th.bfloat16):
         outputs = network(inputs)
     assert outputs.dtype == th.bfloat16
@@ -105,7 +105,7 @@ def test_autocast_is_pytorchs():
 
 @pytest.mark.parametrize("where", ["inputs", "weight"])
 def test_nan_is_passed_on(where):
-    network, inputs = Perceptron(*copy.deepcopy(NETWORKS["wide"])), th.randn(256, N_INPUTS)
+    network, inputs = MLP(*copy.deepcopy(NETWORKS["wide"])), th.randn(256, N_INPUTS)
     with th.no_grad():
         (inputs if where == "inputs" else network[2].weight)[:] = th.nan
         assert network(inputs).isnan().all()
@@ -113,7 +113,7 @@ def test_nan_is_passed_on(where):
 
 @th.no_grad()
 def test_tracing_sees_the_modules():
-    network, inputs = Perceptron(*copy.deepcopy(NETWORKS["wide"])), th.randn(MANY_ROWS, N_INPUTS)
+    network, inputs = MLP(*copy.deepcopy(NETWORKS["wide"])), th.randn(MANY_ROWS, N_INPUTS)
     traced = th.jit.trace(network, inputs)
     assert "aten::linear" in str(traced.inlined_graph)
     assert "_linear_pointwise" not in str(traced.inlined_graph)
@@ -127,7 +127,7 @@ def test_parameters_have_the_names_that_td3_gives_them():
     model, td3 = CGP("MlpPolicy", **arguments), TD3("MlpPolicy", **arguments)
     assert [name for name, _ in model.policy.named_parameters()] == [name for name, _ in td3.policy.named_parameters()]
     networks = [model.actor.mu, model.actor_target.mu, *model.critic.q_networks, *model.critic_target.q_networks]
-    assert all(type(network) is Perceptron for network in networks)
+    assert all(type(network) is MLP for network in networks)
     # The critics' list and their modules are the same
     model.policy.load_state_dict(td3.policy.state_dict())
     observations, actions = th.randn(40, 3), th.rand(40, 1)

@@ -1,0 +1,250 @@
+"""The CGP that users get: the core's algorithm with the wings around it."""
+
+import io
+import pathlib
+from typing import Any, ClassVar, TypeVar
+
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from sb3_cgp.common.rules import require, require_choice
+from sb3_cgp.core.policies import CGPPolicy
+from sb3_cgp.diagnostics import DiagnosticsAlgorithm
+from sb3_cgp.export.read import ExportedPolicy, load_weights
+from sb3_cgp.export.write import export_policy
+from sb3_cgp.fast.cuda_graph_algorithm import CudaGraphAlgorithm
+from sb3_cgp.fast.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_cgp.fast.replay import LeanReplayAlgorithm
+from sb3_cgp.fast.scoring import SCORING_DTYPES
+from sb3_cgp.resumption.algorithm import ResumableAlgorithm
+
+SelfCGP = TypeVar("SelfCGP", bound="CGP")
+
+
+class CGP(ResumableAlgorithm, DiagnosticsAlgorithm, CudaGraphAlgorithm, LeanReplayAlgorithm):
+    """
+    Cross-Entropy Guided Policies (CGP).
+
+    Learns Q-functions by TD3's objective, with actions picked by the Cross-Entropy Method (CEM), and distils CEM into
+    an actor that acts at inference for the price of one forward pass.
+
+    Paper: https://arxiv.org/abs/1903.10605 (Algorithms 1 and 2; the defaults are Appendix B's)
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param learning_rate: learning rate of the critics, and of the actor unless ``actor_learning_rate`` is given;
+        it can be a function of the current progress remaining (from 1 to 0), or a string such as ``"lin_1e-3"`` for a
+        linear schedule that ends at 0
+    :param buffer_size: size of the replay buffer
+    :param learning_starts: how many random steps to take before learning starts; with few, CGP often fails
+        (the paper's Appendix A)
+    :param batch_size: Minibatch size for each gradient update
+    :param tau: the soft update coefficient of the targets and the averaged actor ("Polyak update", between 0 and 1)
+    :param gamma: the discount factor
+    :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
+        like ``(5, "step")`` or ``(2, "episode")``.
+    :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``)
+        Set to ``-1`` means to do as many gradient steps as steps done in the environment during the rollout.
+    :param action_noise: the action noise type (None by default): CEM explores by its own sampling
+    :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``).
+        If ``None``, it will be automatically selected.
+    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
+    :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer at a cost of more complexity.
+    :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the critics.
+    :param cem_iterations: number of CEM's iterations
+    :param cem_samples: number of actions that CEM samples per state and iteration
+    :param cem_elites: number of best samples to which CEM's next iteration is fitted, at most ``cem_samples``
+    :param cem_result: "best" acts by the best sample of the last iteration (the paper), "mean" by the elites' mean
+    :param cem_dtype: data type of all layers of the critic but the last one while CEM asks it: "float32", "bfloat16", or
+        "auto", which is bfloat16 on processors that multiply it natively. Values, actions and the critic's own training
+        are float32 in any case.
+    :param cuda_graphs: on a GPU, whether gradient steps and CEM's acting are recorded as CUDA graphs, and the replay buffer
+        is kept on the GPU: the same computation in less time. A graph fixes the Python decisions of a user's own selector.
+        Has no effect on a CPU, nor with ``Dict`` observations or another optimizer than the fused Adam.
+    :param policy_loss: the actor's loss: "cgp" imitates CEM, "qgp" follows the critic's gradient,
+        None trains no actor, so that CEM acts at inference too
+    :param policy_training: "online" trains the actor along with the critics, "offline" at the end of ``learn``
+        (see :meth:`train_policy`)
+    :param inference: what ``predict`` asks: the "actor", the "averaged_actor" (φ' of Algorithm 2) or "cem".
+        None stands for the actor, or for CEM where there is no ``policy_loss``. In any case, CEM acts while training,
+        and in offline training until the policy is trained.
+    :param actor_learning_rate: learning rate of the actor, in the same forms. None stands for ``learning_rate``.
+    :param policy_delay: The actor is updated once every ``policy_delay`` gradient steps
+    :param target_update_interval: The target critics and the averaged actor are updated once every
+        ``target_update_interval`` gradient steps
+    :param target_policy_noise: Standard deviation of Gaussian noise added to target actions (smoothing noise)
+    :param target_noise_clip: Limit for absolute value of target policy smoothing noise.
+    :param diagnostics: whether to log diagnostics of the policy every 100 gradient steps, at the cost of a run of CEM
+    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
+        the reported success rate, mean episode length, and mean reward over
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation,
+        see :class:`~sb3_cgp.CGPPolicy`; a ``selector`` among them replaces CEM
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for
+        debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run.
+        Setting it to auto, the code will be run on the GPU if possible.
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :raises ValueError: if an argument is out of its range or contradicts another one
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+
+    def __init__(
+        self,
+        policy: str | type[CGPPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule | str = 1e-3,
+        buffer_size: int = 1_000_000,  # 1e6
+        learning_starts: int = 10_000,
+        batch_size: int = 128,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        cem_iterations: int = 2,
+        cem_samples: int = 64,
+        cem_elites: int = 6,
+        cem_result: str = "best",
+        cem_dtype: str = "auto",
+        cuda_graphs: bool = True,
+        policy_loss: str | None = "cgp",
+        policy_training: str = "online",
+        inference: str | None = None,
+        actor_learning_rate: float | Schedule | str | None = None,
+        policy_delay: int = 1,
+        target_update_interval: int = 2,
+        target_policy_noise: float = 0.2,
+        target_noise_clip: float = 0.5,
+        diagnostics: bool = True,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        # The wings' arguments, which `_setup_model` reads
+        self.cem_dtype = cem_dtype
+        self.cuda_graphs = cuda_graphs
+        self.diagnostics = diagnostics
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            cem_iterations=cem_iterations,
+            cem_samples=cem_samples,
+            cem_elites=cem_elites,
+            cem_result=cem_result,
+            policy_loss=policy_loss,
+            policy_training=policy_training,
+            inference=inference,
+            actor_learning_rate=actor_learning_rate,
+            policy_delay=policy_delay,
+            target_update_interval=target_update_interval,
+            target_policy_noise=target_policy_noise,
+            target_noise_clip=target_noise_clip,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=_init_setup_model,
+        )
+
+    def _setup_model(self) -> None:
+        require_choice("cem_dtype", self.cem_dtype, SCORING_DTYPES)
+        given = self.policy_kwargs.get("cem_dtype")
+        require(given is None, "policy_kwargs['cem_dtype']", given, "given as `cem_dtype`, outside `policy_kwargs`")
+        super()._setup_model()
+        self.policy.cem_dtype = self.cem_dtype  # type: ignore[assignment]
+
+    @classmethod
+    def load(
+        cls: type[SelfCGP],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfCGP:
+        """
+        Load the model from a zip-file, as SB3 does.
+
+        Its replay buffer is None until ``learn`` allocates it or ``load_replay_buffer`` loads one.
+
+        :param path: path to the file (or a file-like) where to load the agent from
+        :param env: the new environment to run the loaded model on
+            (can be None if you only need prediction from a trained model) has priority over any saved environment
+        :param device: Device on which the code should run.
+        :param custom_objects: Dictionary of objects to replace upon loading. A ``learning_rate`` among them replaces an
+            actor's own learning rate too: rl_zoo3 replaces schedules that another version of Python may have pickled.
+        :param print_system_info: Whether to print system info from the saved model and the current system info
+        :param force_reset: Force call to ``reset()`` before training to avoid unexpected behavior.
+        :param kwargs: arguments to change in the model when loading, such as ``cem_iterations=4``
+        :return: new model instance with loaded parameters
+        :raises ValueError: if a changed argument is out of its range or contradicts another one
+        """
+        if custom_objects is not None and "learning_rate" in custom_objects:
+            custom_objects = {"actor_learning_rate": None} | custom_objects
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+    def export(self, folder: str | pathlib.Path) -> None:
+        """
+        Write the policy that ``predict`` asks, to be used elsewhere and loaded without pickle.
+
+        ``policy.onnx`` takes a batch of observations as the environment returns them (images channels first) and returns
+        actions as the environment takes them; VecNormalize's present statistics are part of it.
+        ``policy.safetensors`` and ``policy.json`` are what :meth:`load_weights` reads. Both are evaluated on a few random
+        observations, and compared with ``predict``, before any file is written.
+
+        :param folder: where to write; it is made if it is missing. An export in it is replaced when all files of the
+            new one are on the disk.
+        :raises ValueError: if the policy cannot be exported, naming the obstacle and what is allowed: an actor must
+            act, on a ``Box``, by SB3's own features extractors and one of PyTorch's usual activation functions
+        :raises ImportError: if a package of the ``export`` extra is not installed
+        """
+        export_policy(self, folder)
+
+    @classmethod
+    def load_weights(cls, folder: str | pathlib.Path) -> ExportedPolicy:
+        """
+        Load a policy that :meth:`export` wrote, from safetensors and JSON alone. Unlike :meth:`load`, it cannot run code
+        that someone put into the files.
+
+        :param folder: where the policy was exported to
+        :return: a policy that predicts, and cannot be trained; it takes observations that are not normalised
+        :raises ValueError: if a file is damaged or of another export, or an entry is not allowed; it names the file and why
+        :raises FileNotFoundError: if ``policy.json`` or ``policy.safetensors`` is missing
+        :raises ImportError: if safetensors is not installed
+        """
+        return load_weights(folder)

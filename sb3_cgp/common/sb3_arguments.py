@@ -1,0 +1,86 @@
+"""The rules on the arguments that SB3's off-policy algorithms have, and the forms of a learning rate."""
+
+import math
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.noise import VectorizedActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+
+from sb3_cgp.common.rules import require, require_count, require_number
+
+LINEAR_SCHEDULE_PREFIX = "lin_"
+
+
+def as_schedule(rate: float | Schedule | str) -> Schedule:
+    """
+    Convert a learning rate to a schedule.
+
+    :param rate: a number, a schedule, or a string such as ``"lin_1e-3"`` for a linear schedule that ends at 0
+    :return: the schedule, a function of the progress remaining
+    """
+    if isinstance(rate, str):
+        return LinearSchedule(float(rate.removeprefix(LINEAR_SCHEDULE_PREFIX)), 0.0, 1.0)
+    return FloatSchedule(rate)
+
+
+def check_learning_rate(name: str, value: Any) -> None:
+    """
+    Check a learning rate. Zero is allowed, as rl_zoo3 loads models with it to watch them.
+
+    :param name: the argument's name
+    :param value: the argument's value
+    :raises ValueError: if the value is not a number >= 0, a schedule or a string such as ``"lin_1e-3"``
+    """
+    if isinstance(value, str):
+        prefix, _, initial_value = value.partition("_")
+        try:
+            is_valid = f"{prefix}_" == LINEAR_SCHEDULE_PREFIX and 0.0 <= float(initial_value) < math.inf
+        except ValueError:
+            is_valid = False
+        require(is_valid, name, value, f"a number >= 0, a schedule, or a string such as '{LINEAR_SCHEDULE_PREFIX}1e-3'")
+    elif not callable(value):
+        require_number(name, value)
+
+
+def check_train_freq(value: Any) -> None:
+    """
+    Check ``train_freq``: a number of steps, or a pair of a number and its unit.
+
+    :param value: the argument's value
+    :raises ValueError: if the number is not an integer >= 1 or the unit is unknown
+    """
+    is_pair = isinstance(value, tuple) and len(value) == 2
+    frequency, unit = value if is_pair else (value, "step")
+    # SB3 accepts no NumPy integer here
+    require(isinstance(frequency, int), "train_freq", value, "an int, or a tuple of an int and a unit")
+    require_count("train_freq", frequency)
+    require(getattr(unit, "value", unit) in ("step", "episode"), "train_freq", value, "in unit 'step' or 'episode'")
+
+
+def check_off_policy_arguments(model: OffPolicyAlgorithm) -> None:
+    """
+    Check the arguments that an algorithm has from SB3's ``OffPolicyAlgorithm``, as attributes of the model.
+
+    :param model: the model, before its networks are built
+    :raises ValueError: naming the first argument that breaks a rule, its value and what is allowed
+    """
+    for name in ("batch_size", "buffer_size", "n_steps"):
+        require_count(name, getattr(model, name))
+    require_count("learning_starts", model.learning_starts, minimum=0)
+    require_count("gradient_steps", model.gradient_steps, minimum=-1)
+    check_train_freq(model.train_freq)
+    for name in ("tau", "gamma"):
+        require_number(name, getattr(model, name), high=1.0)
+    check_learning_rate("learning_rate", model.learning_rate)
+    noise = model.action_noise.base_noise if isinstance(model.action_noise, VectorizedActionNoise) else model.action_noise
+    # SB3 has no public attribute for the standard deviation of an action noise
+    is_valid = bool(np.all(np.asarray(getattr(noise, "_sigma", 0.0)) >= 0.0))
+    require(is_valid, "action_noise", noise, "noise of standard deviation >= 0")
+    # Where SB3 chooses the replay buffer, it asserts this
+    is_supported = model.n_steps == 1 or not isinstance(model.observation_space, spaces.Dict)
+    allowed = "1 with a Dict observation space, for which SB3 has no n-step replay buffer"
+    require(is_supported, "n_steps", model.n_steps, allowed)

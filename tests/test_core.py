@@ -1,0 +1,88 @@
+"""The core alone: every wing is blocked from being imported, and the core trains as the whole package does."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+
+import sb3_cgp
+from sb3_cgp import CGP
+from sb3_cgp.core import cgp, policies
+
+WINGS = sorted(
+    path.stem
+    for path in Path(sb3_cgp.__file__).parent.iterdir()
+    if (path.is_dir() or path.suffix == ".py") and path.stem not in ("__init__", "__pycache__", "core", "common", "hyperparams")
+)
+ARGUMENTS = dict(
+    env="Pendulum-v1", learning_starts=50, buffer_size=1_000, batch_size=16, cem_samples=8, cem_elites=2, seed=0, device="cpu"
+)
+ALONE = """
+import json, sys, types
+import torch as th
+
+package = types.ModuleType("sb3_cgp")
+package.__path__ = [{package!r}]
+sys.modules["sb3_cgp"] = package
+blocked = [f"sb3_cgp.{{wing}}" for wing in {wings!r}] + ["rl_zoo3", "optuna", "filelock"]
+
+
+class Block:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        if any(f"{{name}}.".startswith(f"{{each}}.") for each in blocked):
+            raise ImportError(f"{{name}} is blocked")
+
+
+sys.meta_path.insert(0, Block)
+th.set_num_threads(1)
+from sb3_cgp.core.cgp import CGP
+
+model = CGP("MlpPolicy", policy_kwargs=dict(net_arch=[16, 16]), **{arguments!r}, **{variant!r}).learn(150)
+th.save(model.policy.state_dict(), {path!r})
+assert model._n_updates == 100
+assert not any(name in sys.modules for name in blocked)
+try:
+    import sb3_cgp.fast.scoring
+except ImportError:
+    sys.exit(0)
+sys.exit("nothing is blocked")
+"""
+VARIANTS = {"CGP": dict(), "QGP": dict(policy_loss="qgp", policy_delay=2), "CEM": dict(policy_loss=None)}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_core_trains_without_any_wing_as_the_whole_package_does(variant, tmp_path):
+    assert {"algorithm", "fast", "guards", "resumption", "export", "zoo", "diagnostics"} <= set(WINGS)
+    path = str(tmp_path / "policy.pt")
+    kwargs = VARIANTS[variant]
+    script = ALONE.format(
+        package=str(Path(sb3_cgp.__file__).parent), wings=WINGS, arguments=ARGUMENTS, variant=kwargs, path=path
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
+    alone = th.load(path)
+    assert alone
+
+    # With the core's own networks and scoring, the wings change no bit
+    whole = CGP(policies.CGPPolicy, policy_kwargs=dict(net_arch=[16, 16]), **ARGUMENTS, **kwargs).learn(150)
+    assert all(th.equal(whole.policy.state_dict()[name], value) for name, value in alone.items())
+
+    # With the fast ones, values differ by rounding alone
+    fast = CGP("MlpPolicy", policy_kwargs=dict(net_arch=[16, 16]), cem_dtype="float32", **ARGUMENTS, **kwargs).learn(150)
+    for name, value in alone.items():
+        th.testing.assert_close(fast.policy.state_dict()[name], value, rtol=1e-3, atol=1e-4, msg=name)
+
+
+def test_the_core_takes_every_argument_of_the_whole_that_is_not_a_wings():
+    model = cgp.CGP("MlpPolicy", policy_kwargs=dict(net_arch=[8]), tau=0.1, gamma=0.9, n_steps=3, verbose=0, **ARGUMENTS)
+    assert (model.tau, model.gamma, model.replay_buffer.n_steps) == (0.1, 0.9, 3)
+    action, _ = model.predict(np.zeros(3, np.float32))
+    assert action.shape == (1,)
+
+
+def test_the_core_is_read_in_a_sitting():
+    folder = Path(cgp.__file__).parent
+    assert sum(len(path.read_text().splitlines()) for path in folder.glob("*.py")) <= 700
