@@ -268,6 +268,35 @@ class TestOffline:
         loaded.save(tmp_path / "trained")
         assert CGP.load(tmp_path / "trained").policy.inference == "actor"
 
+    def test_callbacks_see_the_locals_of_an_online_training(self):
+        class Locals(self.Watcher):
+            def __init__(self):
+                super().__init__()
+                self.started, self.stepped = [], []
+
+            def _on_training_start(self):
+                self.started.append(dict(self.locals))
+
+            def _on_step(self):
+                self.stepped.append(dict(self.locals))
+                return True
+
+        watcher = Locals()
+        env = make_vec_env("Pendulum-v1", n_envs=2)
+        model = make_model(env, policy_training="offline").learn(100, callback=watcher, progress_bar=True)
+        online, offline = watcher.started
+        assert set(online) <= set(offline)
+        assert offline["total_timesteps"] - model.num_timesteps == 2 * 100_000
+        first, last = watcher.stepped[0], watcher.stepped[-1]
+        # But for the names of loops that have not begun at a rollout's first step
+        assert set(first) <= set(last)
+        for name in ("rewards", "dones", "actions", "buffer_actions", "new_obs"):
+            assert (last[name].shape, last[name].dtype) == (first[name].shape, first[name].dtype), name
+        assert not last["rewards"].any()
+        assert not last["dones"].any()
+        assert last["infos"] == [{}, {}]
+        assert last["env"] is model.get_env()
+
     def test_an_online_policy_can_be_trained_further(self):
         model = make_model().learn(100)
         before = next(model.actor.parameters()).clone()

@@ -15,13 +15,14 @@ from sb3_cgp.core import cgp, policies
 WINGS = sorted(
     path.stem
     for path in Path(sb3_cgp.__file__).parent.iterdir()
-    if (path.is_dir() or path.suffix == ".py") and path.stem not in ("__init__", "__pycache__", "core", "common", "hyperparams")
+    if (path.is_dir() or path.suffix == ".py")
+    and path.stem not in ("__init__", "__pycache__", "core", "common", "hyperparams")
 )
 ARGUMENTS = dict(
     env="Pendulum-v1", learning_starts=50, buffer_size=1_000, batch_size=16, cem_samples=8, cem_elites=2, seed=0, device="cpu"
 )
 ALONE = """
-import json, sys, types
+import sys, types
 import torch as th
 
 package = types.ModuleType("sb3_cgp")
@@ -41,9 +42,7 @@ sys.meta_path.insert(0, Block)
 th.set_num_threads(1)
 from sb3_cgp.core.cgp import CGP
 
-model = CGP("MlpPolicy", policy_kwargs=dict(net_arch=[16, 16]), **{arguments!r}, **{variant!r}).learn(150)
-th.save(model.policy.state_dict(), {path!r})
-assert model._n_updates == 100
+{training}
 assert not any(name in sys.modules for name in blocked)
 try:
     import sb3_cgp.fast.scoring
@@ -51,7 +50,28 @@ except ImportError:
     sys.exit(0)
 sys.exit("nothing is blocked")
 """
+TRAINING = """
+model = CGP("MlpPolicy", policy_kwargs=dict(net_arch=[16, 16]), **{arguments!r}, **{variant!r}).learn(150)
+th.save(model.policy.state_dict(), {path!r})
+assert model._n_updates == 100
+"""
+LEARNING = """
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+
+model = CGP(
+    "MlpPolicy", make_vec_env("Pendulum-v1", seed=0), learning_starts=1_000, gamma=0.98, tau=0.02, batch_size=64,
+    policy_kwargs=dict(net_arch=[64, 64]), seed=0, device="cpu",
+).learn(6_000)
+print(evaluate_policy(model, make_vec_env("Pendulum-v1", seed=1_000), n_eval_episodes=20)[0], flush=True)
+"""
 VARIANTS = {"CGP": dict(), "QGP": dict(policy_loss="qgp", policy_delay=2), "CEM": dict(policy_loss=None)}
+
+
+def run_alone(training):
+    """Run a script in a process in which no wing can be imported, and return what it prints."""
+    script = ALONE.format(package=str(Path(sb3_cgp.__file__).parent), wings=WINGS, training=training)
+    return subprocess.run([sys.executable, "-c", script], check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -59,10 +79,7 @@ def test_the_core_trains_without_any_wing_as_the_whole_package_does(variant, tmp
     assert {"algorithm", "fast", "guards", "resumption", "export", "zoo", "diagnostics"} <= set(WINGS)
     path = str(tmp_path / "policy.pt")
     kwargs = VARIANTS[variant]
-    script = ALONE.format(
-        package=str(Path(sb3_cgp.__file__).parent), wings=WINGS, arguments=ARGUMENTS, variant=kwargs, path=path
-    )
-    subprocess.run([sys.executable, "-c", script], check=True)
+    run_alone(TRAINING.format(arguments=ARGUMENTS, variant=kwargs, path=path))
     alone = th.load(path)
     assert alone
 
@@ -86,3 +103,9 @@ def test_the_core_takes_every_argument_of_the_whole_that_is_not_a_wings():
 def test_the_core_is_read_in_a_sitting():
     folder = Path(cgp.__file__).parent
     assert sum(len(path.read_text().splitlines()) for path in folder.glob("*.py")) <= 700
+
+
+@pytest.mark.slow
+def test_the_core_alone_swings_up_the_pendulum():
+    # Random actions earn about -1200, the best known policies about -150
+    assert float(run_alone(LEARNING)) >= -200

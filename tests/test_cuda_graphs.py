@@ -4,6 +4,7 @@ that it was recorded with: everything but PyTorch's CUDA graphs is tested on any
 """
 
 import copy
+import pickle
 import re
 import warnings
 from contextlib import contextmanager, nullcontext
@@ -237,6 +238,33 @@ def test_a_nan_loss_ends_the_training_at_the_next_look_at_it(stand_in):
     model.replay_buffer.rewards[:] = np.inf
     with pytest.raises(ValueError, match="critic loss was NaN or infinite at gradient step 31"):
         model.learn(5, reset_num_timesteps=False)
+
+
+def test_a_training_state_has_the_losses_of_recorded_steps_in_its_log(stand_in):
+    model = make_model().learn(60)
+    model.logger.name_to_value.clear()
+    model.train(1, 16)
+    (loss,) = model._unlogged["critic_loss"]
+    model.get_training_state()
+    assert model.logger.name_to_value["train/critic_loss"] == pytest.approx(loss.item())
+    # A NaN is reported before a state is saved that would hide it
+    model.replay_buffer.rewards[:] = np.nan
+    model.train(1, 16)
+    with pytest.raises(ValueError, match="The critic loss was NaN or infinite at gradient step 32"):
+        model.get_training_state()
+
+
+@pytest.mark.parametrize("copy_of", [copy.deepcopy, lambda model: pickle.loads(pickle.dumps(model))], ids=["copy", "pickle"])
+def test_a_copied_model_records_anew_and_trains_on_alike(stand_in, copy_of):
+    model = make_model().learn(60)
+    copied = copy_of(model)
+    assert copied._recorded == {}
+    made = StandIn.made
+    for each in (model, copied):
+        each.set_random_seed(3)
+        each.learn(20, reset_num_timesteps=False)
+    assert StandIn.made > made
+    assert th.equal(parameters(model), parameters(copied))
 
 
 def test_a_synchronizing_step_is_carried_out_as_it_is(stand_in, monkeypatch):
