@@ -20,7 +20,9 @@ from stable_baselines3.common.envs import BitFlippingEnv
 
 from sb3_cgp import CGP
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
+from sb3_cgp.zoo import folders
 from sb3_cgp.zoo import registration as zoo
+from sb3_cgp.zoo.search_space import VARIANTS
 
 PAPER_TASKS = {f"{task}-v{version}" for task in ("HalfCheetah", "Humanoid", "Hopper", "Pusher", "Ant") for version in (4, 5)}
 OTHER_TASKS = {"Pendulum-v1", "MountainCarContinuous-v0"} | {
@@ -92,13 +94,13 @@ def test_default_config_of_other_algorithms_and_a_config_given_are_kept(tmp_path
 
 def test_hyperparams_folder_inside_the_package_or_beside_it(monkeypatch, tmp_path):
     package = tmp_path / "sb3_cgp"
-    monkeypatch.setattr(zoo, "__file__", str(package / "zoo" / "registration.py"))
+    monkeypatch.setattr(folders, "__file__", str(package / "zoo" / "folders.py"))
     with pytest.raises(FileNotFoundError, match="install sb3_cgp again"):
-        zoo.hyperparams_folder()
+        folders.hyperparams_folder()
     for folder in (tmp_path / "hyperparams", package / "hyperparams"):
         folder.mkdir(parents=True)
         (folder / "cgp.yml").touch()
-        assert zoo.hyperparams_folder() == folder
+        assert folders.hyperparams_folder() == folder
 
 
 def test_push_to_hub_starts_and_writes_a_model_card(tmp_path):
@@ -236,7 +238,7 @@ def corners() -> list[dict]:
     zoo.sample_cgp_params(trial, 1, 1, NO_HER)
     ranges = {name: d for name, d in trial.distributions.items() if not isinstance(d, CategoricalDistribution)}
     ends = [{name: getattr(distribution, end) for name, distribution in ranges.items()} for end in ("low", "high")]
-    return [trial.params | end | {"variant": variant} for end in ends for variant in zoo.VARIANTS]
+    return [trial.params | end | {"variant": variant} for end in ends for variant in VARIANTS]
 
 
 @pytest.mark.parametrize("parameters", corners() + random_parameters(50))

@@ -30,8 +30,9 @@ from benchmark.sweeps.storages import STORAGE_ERRORS
 from sb3_cgp.common.files import write_atomically
 from sb3_cgp.resumption.algorithm import resumable
 from sb3_cgp.resumption.store import NoStateLeftError, StateStore
-from sb3_cgp.zoo.registration import register, state_folder
-from sb3_cgp.zoo.resume import ResumedExperiment
+from sb3_cgp.zoo.folders import state_folder
+from sb3_cgp.zoo.registration import register
+from sb3_cgp.zoo.resumed_run import ResumedExperiment
 
 # What a run's states belong to, in its folder
 SETTINGS = "run.json"
