@@ -22,7 +22,7 @@ echo >> "$CALLS"
 case "$*" in
   --version) echo "Python 3.9.1" ;;
   "-c import sys"*) [ -z "$OLD" ] ;;
-  "-m venv"*) mkdir -p .venv/bin && cp "$0" .venv/bin/python && chmod +x .venv/bin/python ;;
+  "-m venv"*) mkdir -p .venv/bin && cp "$0" .venv/bin/python && chmod +x .venv/bin/python && cp .venv/bin/python .venv/bin/lint-imports ;;
   "-m benchmark.plan"*) echo "250 4" ;;
   *"$FAIL"*) [ -z "$FAIL" ] ;;
 esac
@@ -76,7 +76,7 @@ def test_train_from_a_fresh_clone(clone: Clone) -> None:
     assert ended.returncode == 0, ended.stderr
     assert calls[1:] == [
         "-m venv --clear .venv",
-        "-m pip install -c constraints.txt -e .[benchmark]",
+        "-m pip install -c constraints.txt -e .[zoo]",
         "-m benchmark.plan --algo cgp --env Pendulum-v1 --folder logs",
         "-m rl_zoo3.train --algo cgp --env Pendulum-v1 --seed 0 --num-threads 1 --eval-freq 250 --eval-episodes 10 "
         "--log-folder logs --progress",
@@ -125,7 +125,21 @@ def test_resume_without_a_run_says_how_to_name_one(clone: Clone) -> None:
     assert not starting(calls, "-m sb3_cgp")
 
 
-@pytest.mark.parametrize("goal", ["train", "test"])
+def test_every_goal_installs_its_extra_once(clone: Clone) -> None:
+    goals = ("train", "sweeps", "test", "train", "test-slow", "sweeps", "resume")
+    installed = [starting(clone.make(goal, RUN="logs/cgp/Ant-v5_2")[0], "-m pip") for goal in goals]
+    extras = [[call.partition("-e ")[2] for call in calls] for calls in installed]
+    assert extras == [[".[zoo]"], [".[sweeps]"], [".[tests]"], [], [], [], []]
+
+
+def test_lint_checks_formatting_imports_and_types_and_test_uses_every_core(clone: Clone) -> None:
+    calls, ended = clone.make("test")
+    assert ended.returncode == 0, ended.stderr
+    expected = ("-m ruff check .", "-m black --check .", "--no-logo", "-m mypy", "-m pytest --numprocesses logical")
+    assert all(starting(calls, prefix) for prefix in expected)
+
+
+@pytest.mark.parametrize("goal", ["train", "test", "sweeps"])
 def test_nothing_is_installed_twice(clone: Clone, goal: str) -> None:
     clone.make(goal)
     calls, ended = clone.make(goal)
@@ -140,7 +154,7 @@ def test_changed_requirements_are_installed_over_the_environment(clone: Clone, n
     clone.touch(name)
     calls, _ = clone.make("lint")
     assert starting(calls, "-m pip") == [
-        "-m pip install -c constraints.txt -e .[benchmark]",
+        "-m pip install -c constraints.txt -e .[zoo]",
         "-m pip install -c constraints.txt -e .[tests]",
     ]
     assert not starting(calls, "-m venv")
@@ -174,7 +188,7 @@ def test_old_python_is_refused_by_name(clone: Clone) -> None:
 def test_help_is_the_default_and_lists_every_goal(clone: Clone) -> None:
     calls, ended = clone.make()
     assert not calls
-    for goal in ("train", "resume", "test", "test-slow", "lint", "format", "clean"):
+    for goal in ("train", "resume", "sweeps", "test", "test-slow", "lint", "format", "clean"):
         assert f"make {goal} " in ended.stdout
 
 
