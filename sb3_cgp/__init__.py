@@ -1,15 +1,12 @@
 """Cross-Entropy Guided Policies (CGP) for Stable-Baselines3."""
 
-from pathlib import Path
-
 from sb3_cgp.algorithm import CGP
+from sb3_cgp.common.version import __version__
 from sb3_cgp.core.cem import CEM, ActionSelector, Selection
-from sb3_cgp.export.read import ExportedPolicy
+from sb3_cgp.export.policy import ExportedPolicy
 from sb3_cgp.fast.policies import CGPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
 from sb3_cgp.resumption.environments import RestorableEnv
-
-__version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
 __all__ = [
     "CEM",

@@ -25,8 +25,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from torch import nn
 
 from sb3_cgp import CGP
-from sb3_cgp.export import read as exported
-from sb3_cgp.export.read import describe_box
+from sb3_cgp.export import description as exported
+from sb3_cgp.export.description import describe_box
 
 FILES = ("policy.onnx", "policy.safetensors", "policy.json")
 VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float32)
@@ -217,7 +217,7 @@ def test_description_is_plain_json(exports):
 )
 def test_boxes_come_back_as_they_were(box):
     text = json.dumps(describe_box(box), allow_nan=False)
-    assert exported._read_box(json.loads(text), "space", exported.OBSERVATION_DTYPES) == box
+    assert exported.read_box(json.loads(text), "space", exported.OBSERVATION_DTYPES) == box
 
 
 # What cannot be exported
@@ -306,10 +306,11 @@ def test_missing_extra_is_named(missing, tmp_path, monkeypatch):
 
     model = make_model()
     monkeypatch.setattr("importlib.import_module", import_module)
-    with pytest.raises(ImportError, match=rf"needs {missing}, which is not installed: pip install sb3-cgp\[export\]"):
+    remedy = r'pip install "sb3-cgp\[export\]" \(in a clone: pip install -e "\.\[export\]"\)'
+    with pytest.raises(ImportError, match=rf"needs {missing}, which is not installed: {remedy}"):
         model.export(tmp_path)
     if missing == "safetensors":
-        with pytest.raises(ImportError, match=r"pip install sb3-cgp\[export\]"):
+        with pytest.raises(ImportError, match=remedy):
             CGP.load_weights(tmp_path)
 
 

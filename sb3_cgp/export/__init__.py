@@ -1,1 +1,1 @@
-"""Exporting a policy, and loading an exported policy without pickle."""
+"""Exporting a policy to ONNX, safetensors and JSON, and loading it without pickle. It needs the extra ``export``."""

@@ -1,4 +1,4 @@
-"""Exporting a policy: as ONNX to act anywhere, and as safetensors and JSON, from which it can be loaded without pickle."""
+"""Exporting a policy: as ONNX, to act elsewhere, and as safetensors and JSON, to be loaded without pickle."""
 
 import hashlib
 import json
@@ -6,17 +6,19 @@ import logging
 import warnings
 from copy import deepcopy
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.td3.policies import Actor
 
+from sb3_cgp.common.extras import import_from_extra
 from sb3_cgp.common.files import replace_all
 from sb3_cgp.common.rules import require
-from sb3_cgp.export.read import (
+from sb3_cgp.common.version import __version__
+from sb3_cgp.export.description import (
     ACTIVATIONS,
     DESCRIPTION_FILE,
     EXPORTABLE_INFERENCES,
@@ -27,47 +29,64 @@ from sb3_cgp.export.read import (
     ONNX_FILE,
     TENSORS_FILE,
     VARIANCE,
-    ExportedPolicy,
-    build,
     describe_box,
-    optional,
 )
+from sb3_cgp.export.policy import ExportedPolicy
+from sb3_cgp.export.read import PURPOSE, build
 
-if TYPE_CHECKING:
-    from sb3_cgp.core.cgp import CGP
-
-# The newest that PyTorch's exporter writes without converting, and that runtimes since 2023 read
+# The newest opset that PyTorch's exporter writes without a conversion; runtimes since 2023 read it
 OPSET = 18
+# Observations at which an export is compared with `predict`
 CHECKED_OBSERVATIONS = 16
 
 
-def export_policy(model: "CGP", folder: str | Path) -> None:
+class ExportableModel(Protocol):
+    """The attributes of a trained model that an export reads."""
+
+    policy: Any
+    actor: Actor
+    actor_target: Actor
+    env: VecEnv | None
+    observation_space: spaces.Space
+    action_space: spaces.Space
+    # Whether the model learnt from observations that VecNormalize normalised; None before it has learnt
+    _learnt_normalized: bool | None
+
+    def get_vec_normalize_env(self) -> VecNormalize | None:
+        """Return the VecNormalize wrapper of the model's environment, as SB3's models do."""
+
+    def predict(self, observation: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return actions, as SB3's models do."""
+
+
+def export_policy(model: ExportableModel, folder: str | Path) -> None:
     """
     Write ``policy.onnx``, ``policy.safetensors`` and ``policy.json``, see :meth:`sb3_cgp.CGP.export`.
 
     :param model: the model
-    :param folder: where to write; it is made if it is missing
-    :raises ValueError: if the policy cannot be exported, naming what is in the way and what is allowed
+    :param folder: the folder for the files; it is created if it is missing
+    :raises ValueError: if the policy cannot be exported, naming the obstacle and what is allowed
     :raises ImportError: if a package of the ``export`` extra is not installed
     """
-    safetensors_torch = optional("safetensors.torch")
-    for name in ("onnx", "onnxscript", "onnxruntime"):
-        optional(name)
+    names = ("safetensors.torch", "onnxruntime", "onnx", "onnxscript")
+    safetensors_torch, onnxruntime, *_ = (import_from_extra(name, "export", PURPOSE) for name in names)
     normalizer = _normalizer(model)
     description = _describe(model, normalizer)
     tensors = _tensors(model, normalizer)
     policy = build(description, tensors)
     observations = _observations(policy.observation_space, normalizer)
-    expected, _ = model.predict(observations if normalizer is None else normalizer.normalize_obs(observations))
+    normalized = observations if normalizer is None else np.asarray(normalizer.normalize_obs(observations))
+    expected, _ = model.predict(normalized)
     _check_same("policy", policy.predict(observations)[0], expected, policy.action_space)
-    contents = {TENSORS_FILE: safetensors_torch.save(tensors), ONNX_FILE: _checked_onnx(policy, observations, expected)}
+    onnx_content = _checked_onnx(policy, observations, expected, onnxruntime)
+    contents = {TENSORS_FILE: safetensors_torch.save(tensors), ONNX_FILE: onnx_content}
     description["sha256"] = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
     contents[DESCRIPTION_FILE] = (json.dumps(description, indent=2, allow_nan=False) + "\n").encode()
     replace_all(Path(folder), contents)
 
 
-def _normalizer(model: "CGP") -> VecNormalize | None:
-    """Find what normalises the observations, if anything does."""
+def _normalizer(model: ExportableModel) -> VecNormalize | None:
+    """Return the wrapper that normalises the observations, or None if they are not normalised."""
     normalizer = model.get_vec_normalize_env()
     normalizes = normalizer is not None and normalizer.norm_obs
     require(
@@ -90,22 +109,19 @@ def _normalizer(model: "CGP") -> VecNormalize | None:
     return normalizer
 
 
-def _describe(model: "CGP", normalizer: VecNormalize | None) -> dict[str, Any]:
-    """Say what the policy is, as plain JSON; the files' checksums are missing yet."""
-    # The package is not whole while this module is imported
-    from sb3_cgp import __version__
-
+def _describe(model: ExportableModel, normalizer: VecNormalize | None) -> dict[str, Any]:
+    """Return the description of the policy in plain JSON, without the checksums of the other files."""
     policy = model.policy
     require(
         policy.inference in EXPORTABLE_INFERENCES,
         "inference",
         policy.inference,
-        "'actor' or 'averaged_actor' to be exported: there is no trained actor, or it is not asked (see `train_policy`)",
+        "'actor' or 'averaged_actor' to be exported: there is no trained actor, or it does not act (see `train_policy`)",
     )
     require(
         isinstance(model.observation_space, spaces.Box), "observation_space", model.observation_space, "a Box to be exported"
     )
-    actor = _asked_actor(model)
+    actor = _acting_actor(model)
     require(type(actor) is Actor, "actor", type(actor), "SB3's own to be exported")
     for name, value, allowed in (
         ("activation_fn", actor.activation_fn, ACTIVATIONS),
@@ -139,25 +155,25 @@ def _describe(model: "CGP", normalizer: VecNormalize | None) -> dict[str, Any]:
     }
 
 
-def _asked_actor(model: "CGP") -> Actor:
-    """Find the network that ``predict`` asks."""
+def _acting_actor(model: ExportableModel) -> Actor:
+    """Return the network that ``predict`` uses."""
     return model.actor_target if model.policy.inference == "averaged_actor" else model.actor
 
 
-def _tensors(model: "CGP", normalizer: VecNormalize | None) -> dict[str, th.Tensor]:
-    """Copy the parameters and buffers of the network, and the statistics of the observations."""
-    state = _asked_actor(model).state_dict()
+def _tensors(model: ExportableModel, normalizer: VecNormalize | None) -> dict[str, th.Tensor]:
+    """Return copies of the network's parameters and buffers, and the statistics of the observations, by name."""
+    state = _acting_actor(model).state_dict()
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in state.items()}
     if normalizer is not None:
         statistics = normalizer.obs_rms
-        # Only a Dict's would be by key
+        # Only the statistics of a Dict space are a dictionary
         assert not isinstance(statistics, dict)
         tensors[MEAN], tensors[VARIANCE] = (th.tensor(each, dtype=th.float64) for each in (statistics.mean, statistics.var))
     return tensors
 
 
 def _observations(space: spaces.Box, normalizer: VecNormalize | None) -> np.ndarray:
-    """Draw observations that do not all end at a bound, without a touch on the space's own random numbers."""
+    """Return random observations around the normaliser's mean, so that not all are clipped; leave the space's generator."""
     space = deepcopy(space)
     space.seed(0)
     samples = np.stack([space.sample() for _ in range(CHECKED_OBSERVATIONS)])
@@ -165,7 +181,7 @@ def _observations(space: spaces.Box, normalizer: VecNormalize | None) -> np.ndar
 
 
 def _check_same(what: str, actions: np.ndarray, expected: np.ndarray, space: spaces.Box) -> None:
-    """Refuse an export that acts otherwise than ``predict``, as where a policy was overridden or hooked."""
+    """Refuse an export whose actions differ from those of ``predict``, as those of a policy with a forward hook do."""
     difference = np.max(np.abs(actions - expected) / (space.high - space.low))
     require(
         bool(difference <= 1e-3),
@@ -175,11 +191,11 @@ def _check_same(what: str, actions: np.ndarray, expected: np.ndarray, space: spa
     )
 
 
-def _checked_onnx(policy: ExportedPolicy, observations: np.ndarray, expected: np.ndarray) -> bytes:
-    """Write a policy as ONNX, for batches of any size, and see that it acts as it should."""
+def _checked_onnx(policy: ExportedPolicy, observations: np.ndarray, expected: np.ndarray, onnxruntime: Any) -> bytes:
+    """Return a policy as ONNX, for batches of any size, after a comparison of its actions with the expected ones."""
     registration = logging.getLogger("torch.onnx._internal.exporter._registration")
     level = registration.level
-    # It warns of every operator of torchvision's where that is not installed, and of PyTorch's own deprecations
+    # Without torchvision, the exporter warns of each of its operators; it also warns of deprecated functions of PyTorch
     registration.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
@@ -198,7 +214,7 @@ def _checked_onnx(policy: ExportedPolicy, observations: np.ndarray, expected: np
         registration.setLevel(level)
     assert program is not None
     proto = program.model_proto
-    # PyTorch notes where in the source each node comes from, with this machine's paths
+    # PyTorch writes the source of each node, with paths of the user's machine
     proto.graph.ClearField("metadata_props")
     for part in (
         *proto.graph.node,
@@ -210,7 +226,7 @@ def _checked_onnx(policy: ExportedPolicy, observations: np.ndarray, expected: np
         part.ClearField("metadata_props")
         part.ClearField("doc_string")
     content = proto.SerializeToString()
-    session = optional("onnxruntime").InferenceSession(content, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     actions = session.run(["action"], {"observation": observations})[0]
     _check_same(ONNX_FILE, actions, expected, policy.action_space)
     return content
