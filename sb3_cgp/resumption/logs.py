@@ -5,7 +5,6 @@ import os
 from pathlib import Path
 
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat, make_output_format
-from torch.utils.tensorboard import SummaryWriter
 
 
 def read_start(path: Path) -> float:
@@ -56,5 +55,8 @@ class _ContinuedTensorBoard(TensorBoardOutputFormat):
     """SB3's writer for TensorBoard, whose constructor makes one that purges nothing."""
 
     def __init__(self, folder: str, first_step: int):
+        # TensorBoard is optional, as it is for SB3
+        from torch.utils.tensorboard import SummaryWriter
+
         self.writer = SummaryWriter(log_dir=folder, purge_step=first_step)
         self._is_closed = False
