@@ -1,9 +1,9 @@
-"""The build backend: setuptools', plus the files that setuptools has no way to put into a wheel.
+"""The build backend: that of setuptools, with additional files in the wheel.
 
-Every wheel, an editable one too, gets the start-up hook ``_sb3_cgp_zoo`` and the two lines that start it with Python:
-setuptools installs neither ``.pth`` nor ``.start`` files, and hooking its commands instead would need its private classes.
-The hook itself is copied for an editable install too: it is compiled then, and it survives a checkout that is moved away.
-A regular wheel also gets ``hyperparams/``, which lies outside the package; an editable install reads it where it is.
+Every wheel, also that of an editable install, contains the start-up hook ``_sb3_cgp_zoo`` and the two files that call it at
+the start of Python. setuptools installs neither ``.pth`` nor ``.start`` files, and its commands could be extended only by
+their private classes. An editable install contains a copy of the hook, too: the copy is compiled, and it remains if the
+checkout is moved. A regular wheel also contains ``hyperparams/``, which an editable install reads from the checkout.
 """
 
 import base64
@@ -38,8 +38,8 @@ __all__ = [
 ]
 
 HOOK = "_sb3_cgp_zoo.py"
-# A .pth line is executed as one line, hence exec; guarded, because a hook that is gone or broken must not print at every
-# start. Python 3.15 and later ignore the line where a .start file of the same name exists (PEP 829).
+# A .pth file holds single lines, hence exec. Errors are ignored, because a missing or broken hook must not print at every
+# start of Python. Python 3.15 and later ignore a .pth file beside a .start file of the same name (PEP 829).
 STARTUP_LINES = {
     "sb3_cgp.pth": r'import sys; exec("try:\n import _sb3_cgp_zoo\n _sb3_cgp_zoo.install()\nexcept Exception:\n pass")' "\n",
     "sb3_cgp.start": "_sb3_cgp_zoo:install\n",
@@ -50,9 +50,9 @@ def build_wheel(wheel_directory: str, config_settings: Any = None, metadata_dire
     """
     Build the wheel that ``pip install .`` installs (PEP 517).
 
-    :param wheel_directory: where to put it
-    :param config_settings: the front end's settings, for setuptools
-    :param metadata_directory: metadata that was prepared before, if any
+    :param wheel_directory: the folder for the wheel
+    :param config_settings: the settings of the build front end, for setuptools
+    :param metadata_directory: the folder with prepared metadata, None for none
     :return: the wheel's file name
     """
     name = build_meta.build_wheel(wheel_directory, config_settings, metadata_directory)
@@ -64,9 +64,9 @@ def build_editable(wheel_directory: str, config_settings: Any = None, metadata_d
     """
     Build the wheel that ``pip install -e .`` installs (PEP 660).
 
-    :param wheel_directory: where to put it
-    :param config_settings: the front end's settings, for setuptools
-    :param metadata_directory: metadata that was prepared before, if any
+    :param wheel_directory: the folder for the wheel
+    :param config_settings: the settings of the build front end, for setuptools
+    :param metadata_directory: the folder with prepared metadata, None for none
     :return: the wheel's file name
     """
     name = build_meta.build_editable(wheel_directory, config_settings, metadata_directory)
@@ -76,7 +76,7 @@ def build_editable(wheel_directory: str, config_settings: Any = None, metadata_d
 
 def startup_files() -> dict[str, str]:
     """
-    Read what goes to the top level of site-packages. Front ends run build hooks in the source tree's root.
+    Return the files for the top level of site-packages. The working directory is the root of the source tree (PEP 517).
 
     :return: contents by path inside the wheel
     """
@@ -85,7 +85,7 @@ def startup_files() -> dict[str, str]:
 
 def hyperparams() -> dict[str, str]:
     """
-    Read the YAML files that travel inside the package.
+    Return the YAML files that the package contains in a wheel.
 
     :return: contents by path inside the wheel
     """
@@ -95,9 +95,9 @@ def hyperparams() -> dict[str, str]:
 
 def add_files(wheel: Path, files: Mapping[str, str]) -> None:
     """
-    Add text files to a wheel, and to its RECORD: what is recorded there is also uninstalled.
+    Add text files to a wheel, and to its RECORD, from which an installer uninstalls.
 
-    :param wheel: the wheel, rewritten in place
+    :param wheel: the wheel, which is replaced
     :param files: contents by path inside the wheel
     """
     with zipfile.ZipFile(wheel) as archive:
@@ -108,13 +108,13 @@ def add_files(wheel: Path, files: Mapping[str, str]) -> None:
     writer = csv.writer(rows, lineterminator="\n")
     for path, text in sorted(files.items()):
         content = text.encode()
-        # RECORD's date is the build's, or SOURCE_DATE_EPOCH: builds stay reproducible.
+        # The date of RECORD is that of the build or SOURCE_DATE_EPOCH, so that builds are reproducible.
         member = zipfile.ZipInfo(path, date_time=record.date_time)
         member.external_attr = record.external_attr
         members[member] = content
         digest = base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
         writer.writerow([path, f"sha256={digest}", len(content)])
-    # Last in the archive, as the wheel format recommends.
+    # The wheel format recommends RECORD as the last file of the archive.
     members[record] = rows.getvalue().encode() + members.pop(record)
 
     rewritten = wheel.with_suffix(".tmp")

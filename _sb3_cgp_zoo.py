@@ -1,11 +1,11 @@
-"""Lets rl_zoo3 know CGP, whichever of its scripts is run, from wherever.
+"""Registration of CGP in rl_zoo3 when that is imported, by any of its scripts and from any folder.
 
-Why this exists: rl_zoo3 has no plug-in mechanism. ``python -m rl_zoo3.train --algo cgp`` runs no code of ours unless some
-of it runs with every start of Python, so ``sb3_cgp.pth`` (from Python 3.15 on ``sb3_cgp.start``) calls :func:`install`.
-That only puts one finder on ``sys.meta_path``. When rl_zoo3 has executed one of three of its modules, and not before,
-:mod:`sb3_cgp.zoo.registration` is imported and adds CGP to it.
+rl_zoo3 has no plug-in mechanism, and ``python -m rl_zoo3.train --algo cgp`` executes no code of sb3_cgp. Therefore
+``sb3_cgp.pth`` (from Python 3.15 on, ``sb3_cgp.start``) calls :func:`install` at every start of Python. It adds a finder to
+``sys.meta_path``, and imports nothing. After rl_zoo3 has executed one of the three modules in ``_FUNCTIONS``, the finder
+imports :mod:`sb3_cgp.zoo.registration`, which adds CGP to that module. Without rl_zoo3, nothing else happens.
 
-Why a module of its own: it must import nothing, and whatever is inside ``sb3_cgp`` imports PyTorch.
+This module is outside of the package, because importing ``sb3_cgp`` imports PyTorch.
 """
 
 import sys
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from types import ModuleType
     from typing import Any
 
-# The function of sb3_cgp.zoo.registration to call when rl_zoo3 has executed the module.
+# For each module of rl_zoo3, the function of sb3_cgp.zoo.registration to call after the module's execution
 _FUNCTIONS = {
     "rl_zoo3.utils": "register_algorithm",
     "rl_zoo3.hyperparams_opt": "register_search_space",
@@ -26,7 +26,7 @@ _FUNCTIONS = {
 
 
 class _Finder:
-    """Finds rl_zoo3's modules as the other finders do, and sees to it that registration follows their execution."""
+    """Finds rl_zoo3's modules by the other finders, and has CGP registered after their execution."""
 
     def __init__(self) -> None:
         self._searching: set[str] = set()
@@ -39,10 +39,10 @@ class _Finder:
 
         :param name: full name of the module
         :param path: the parent package's ``__path__``
-        :param target: the module to be reloaded, if it is one
-        :return: where the module is, None to leave it to the other finders
+        :param target: the module that is reloaded, None if the module is imported for the first time
+        :return: the specification of the module, or None for modules of no interest and where the other finders fail
         """
-        # Another finder that asks the whole of sys.meta_path, as this one does, would come back here without end.
+        # A second finder that calls all of sys.meta_path, as this one does, would otherwise cause an endless recursion.
         if name not in _FUNCTIONS or name in self._searching:
             return None
         self._searching.add(name)
@@ -61,14 +61,16 @@ class _Finder:
 
 def _register_after_execution(loader: "Any", name: str) -> None:
     """
-    :param loader: the loader of the module; it keeps its class and all its other methods
+    Have CGP registered after a loader has executed a module.
+
+    :param loader: the loader of the module; it keeps its class and its other methods
     :param name: full name of the module
     """
     execute = loader.exec_module
 
     def exec_module(module: "ModuleType") -> None:
         execute(module)
-        # Some loaders, zipimport's for one, load several modules.
+        # Some loaders, such as zipimport's, load several modules.
         if module.__name__ == name:
             _register(_FUNCTIONS[name])
 
@@ -77,6 +79,8 @@ def _register_after_execution(loader: "Any", name: str) -> None:
 
 def _register(function: str) -> None:
     """
+    Call a function that registers CGP.
+
     :param function: name of the function of :mod:`sb3_cgp.zoo.registration` to call
     """
     try:
@@ -89,15 +93,15 @@ def _register(function: str) -> None:
 
 def _give_up(error: Exception) -> None:
     """
-    Leave rl_zoo3 alone from now on, so that it works on without CGP, and say so once.
+    Remove the finder, so that rl_zoo3 works without CGP, and warn once.
 
-    :param error: what went wrong
+    :param error: the error of the registration
     """
     import warnings
 
     sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, _Finder)]
     warnings.warn(
-        "sb3_cgp is installed but could not register itself in rl_zoo3, which goes on without the algorithm `cgp`: "
+        "sb3_cgp is installed but could not register itself in rl_zoo3, which continues without the algorithm `cgp`: "
         f"{type(error).__name__}: {error}",
         RuntimeWarning,
         stacklevel=2,
@@ -105,6 +109,6 @@ def _give_up(error: Exception) -> None:
 
 
 def install() -> None:
-    """Have CGP registered in rl_zoo3 as soon as that is imported."""
+    """Add the finder to ``sys.meta_path``, unless it is there already."""
     if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
         sys.meta_path.insert(0, _Finder())

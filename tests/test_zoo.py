@@ -126,7 +126,7 @@ def test_the_default_entry_is_the_default_of_cgp():
     assert entry.pop("n_timesteps") == 1e6
     assert entry.pop("policy") == "MlpPolicy"
     assert entry.pop("policy_kwargs") == "dict(net_arch=[256, 256])"
-    assert entry.pop("callback") == [{"sb3_cgp.resumption.callbacks.TrainingCheckpointCallback": {"save_freq": 10_000}}]
+    assert entry.pop("callback") == [{"sb3_cgp.TrainingCheckpointCallback": {"save_freq": 10_000}}]
     assert CGP("MlpPolicy", "Pendulum-v1", buffer_size=1).policy.net_arch == [256, 256]
     defaults = {name: parameter.default for name, parameter in inspect.signature(CGP).parameters.items()}
     assert entry == {name: defaults[name] for name in entry}
@@ -170,7 +170,7 @@ def test_every_run_saves_states_in_its_folder_several_times(tmp_path):
 
 def test_a_folder_that_the_user_chose_is_kept_and_none_is_given_without_a_callback(tmp_path):
     zoo.register()
-    callback = [{"sb3_cgp.resumption.callbacks.TrainingCheckpointCallback": {"save_freq": 10, "path": "mine"}}]
+    callback = [{"sb3_cgp.TrainingCheckpointCallback": {"save_freq": 10, "path": "mine"}}]
     experiment = manager(tmp_path, hyperparams=TINY | {"callback": callback})
     experiment.setup_experiment()
     assert [each.path for each in checkpoints_of(experiment)] == ["mine"]
