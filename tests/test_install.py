@@ -1,9 +1,12 @@
-"""Both kinds of install, each in a fresh virtual environment, and rl_zoo3's scripts run there from a foreign folder.
+"""Installs in fresh virtual environments: regular and editable ones with rl_zoo3, whose scripts run there from another folder,
+and plain ones without any extra.
 
-The fresh environments see the packages of the one that runs the tests, so that nothing is downloaded, but not its start-up
-files: those take effect only where they are installed.
+The fresh environments use the packages of the one that runs the tests, so that nothing is downloaded, but not its start-up
+files: those take effect only where they are installed. A plain environment has links to the packages that the wheel requires,
+and to no other.
 """
 
+import importlib.metadata
 import os
 import re
 import shutil
@@ -16,6 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 pytestmark = pytest.mark.slow
 
@@ -57,12 +62,53 @@ class Environment:
         return {path.relative_to(site_packages).as_posix() for path in site_packages.rglob("*")} - {"__pycache__"}
 
 
-def new_environment(folder: Path) -> Environment:
-    environment = Environment(folder)
+def empty_environment(folder: Path) -> Environment:
     (folder / "elsewhere").mkdir(parents=True)
     venv.create(folder / "venv", symlinks=os.name != "nt")
+    return Environment(folder)
+
+
+def new_environment(folder: Path) -> Environment:
+    environment = empty_environment(folder)
     # A path entry only: unlike in a site-packages folder of its own, .pth files in there are not processed.
     (environment.path("purelib") / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return environment
+
+
+def requirements(names: list[str]) -> set[str]:
+    """The distributions that requirements need, those of requirements included, without pip's extras."""
+    found: set[str] = set()
+    waiting = [(Requirement(name), "") for name in names]
+    while waiting:
+        requirement, extra = waiting.pop()
+        name = canonicalize_name(requirement.name)
+        if (requirement.marker is None or requirement.marker.evaluate({"extra": extra})) and name not in found:
+            found.add(name)
+            assert not requirement.extras, "the wanted extras of a requirement would be left out"
+            waiting += [(Requirement(text), "") for text in importlib.metadata.requires(name) or []]
+    return found
+
+
+def link(environment: Environment, distribution: str) -> None:
+    """Put links to a distribution's files into an environment, but for scripts and start-up files."""
+    borrowed = Path(sysconfig.get_path("purelib"))
+    tops = {file.parts[0] for file in importlib.metadata.files(distribution) if file.parts[0] not in ("..", "__pycache__")}
+    for top in tops:
+        target = environment.path("purelib") / top
+        if not top.endswith(".pth") and (borrowed / top).exists() and not target.exists():
+            target.symlink_to(borrowed / top)
+
+
+@pytest.fixture(scope="module")
+def plain(wheel, tmp_path_factory) -> Environment:
+    """An environment in which the wheel is installed without extras, with what it requires and nothing else."""
+    environment = empty_environment(tmp_path_factory.mktemp("plain"))
+    (metadata,) = importlib.metadata.distributions(path=[str(wheel)])
+    for name in requirements(metadata.requires):
+        link(environment, name)
+    # The wheel's files, as the environment has no pip
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(environment.path("purelib"))
     return environment
 
 
@@ -193,3 +239,35 @@ def test_rl_zoo3_survives_a_half_deleted_sb3_cgp(source, tmp_path):
     output = environment.run("-c", "import rl_zoo3; print(*rl_zoo3.ALGOS)")
     assert output.count("RuntimeWarning: sb3_cgp is installed but could not register itself") == 1
     assert "td3" in output
+
+
+def test_a_plain_install_trains_and_has_nothing_of_an_extra(plain):
+    installed = {path.name.lower() for path in plain.path("purelib").iterdir()}
+    assert {"sb3_cgp", "stable_baselines3", "gymnasium", "torch", "numpy", "filelock"} <= installed
+    extras = {"rl_zoo3", "optuna", "tensorboard", "matplotlib", "pandas", "scipy", "mujoco", "pygame", "safetensors", "yaml"}
+    assert not installed & extras
+    train = "CGP('MlpPolicy', 'Pendulum-v1', learning_starts=20, batch_size=8).learn(60, log_interval=1).save('model')"
+    assert plain.run("-c", f"from sb3_cgp import CGP; {train}") == ""
+    assert plain.run("-c", "from sb3_cgp import CGP; print(CGP.load('model').num_timesteps)") == "60\n"
+
+
+def test_the_hook_of_a_plain_install_is_silent(plain):
+    # Python prints the errors of .pth files
+    assert plain.run("-c", "import sys; print('_sb3_cgp_zoo' in sys.modules, 'sb3_cgp' in sys.modules)") == "True False\n"
+    missing = "try:\n import rl_zoo3.utils\nexcept ModuleNotFoundError as error:\n print(error)"
+    assert plain.run("-c", missing) == "No module named 'rl_zoo3'\n"
+
+
+@pytest.mark.parametrize(
+    ("code", "extra", "missing"),
+    [
+        ("import sb3_cgp.zoo; sb3_cgp.zoo.register()", "zoo", "rl_zoo3"),
+        ("from sb3_cgp.zoo.resume import main; main(['logs/cgp/Pendulum-v1_1'])", "zoo", "rl_zoo3"),
+        ("from sb3_cgp import CGP; CGP.load_weights('export')", "export", "safetensors"),
+        ("from sb3_cgp import CGP; CGP('MlpPolicy', 'Pendulum-v1', buffer_size=10).export('export')", "export", "safetensors"),
+    ],
+)
+def test_what_a_plain_install_lacks_is_named_with_the_extra(code, extra, missing, plain):
+    catching = f"try:\n {code}\nexcept (ImportError, SystemExit) as error:\n print(error)"
+    remedy = f'pip install "sb3-cgp[{extra}]" (in a clone: pip install -e ".[{extra}]")'
+    assert f"needs {missing}, which is not installed: {remedy}\n" in plain.run("-c", catching)

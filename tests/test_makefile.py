@@ -12,8 +12,8 @@ REQUIREMENTS = ("setup.cfg", "pyproject.toml", "constraints.txt", "_build_backen
 
 pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
 
-# Notes each call, with <> around an argument that has spaces; `-m venv` puts a copy of the stand-in where the
-# environment's interpreter would be; $FAIL names what fails.
+# Notes each call, with <> around an argument that has spaces; `-m venv` puts copies of the stand-in where the
+# environment's interpreter and import-linter would be; $FAIL names what fails.
 STAND_IN = """#!/bin/sh
 for argument; do
   case "$argument" in *" "*) printf "<%s> " "$argument" ;; *) printf "%s " "$argument" ;; esac
@@ -22,7 +22,9 @@ echo >> "$CALLS"
 case "$*" in
   --version) echo "Python 3.9.1" ;;
   "-c import sys"*) [ -z "$OLD" ] ;;
-  "-m venv"*) mkdir -p .venv/bin && cp "$0" .venv/bin/python && chmod +x .venv/bin/python && cp .venv/bin/python .venv/bin/lint-imports ;;
+  "-m venv"*)
+    mkdir -p .venv/bin
+    for program in python lint-imports; do cp "$0" .venv/bin/$program && chmod +x .venv/bin/$program; done ;;
   "-m benchmark.plan"*) echo "250 4" ;;
   *"$FAIL"*) [ -z "$FAIL" ] ;;
 esac

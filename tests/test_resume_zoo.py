@@ -21,7 +21,7 @@ from sb3_cgp.zoo import registration as zoo
 from sb3_cgp.zoo.resume import main
 
 EPISODE = 200
-CHECKPOINT = "{'sb3_cgp.resumption.callbacks.TrainingCheckpointCallback': dict(save_freq=250)}"
+CHECKPOINT = "{'sb3_cgp.TrainingCheckpointCallback': dict(save_freq=250)}"
 
 
 class Interruption(Exception):
@@ -199,6 +199,22 @@ def test_what_cannot_be_resumed_is_refused_with_what_to_do(monkeypatch, tmp_path
     path.write_text(path.read_text().replace("cgp", "td3"))
     with pytest.raises(SystemExit, match=r"Error: .* is a run of `td3`, but only those of `cgp` can be resumed"):
         main([str(run_of(tmp_path))])
+
+
+@pytest.mark.parametrize("error", [RuntimeError, TimeoutError, ValueError])
+def test_a_state_that_cannot_be_taken_is_named_without_a_traceback(error, monkeypatch, tmp_path):
+    monkeypatch.setattr(Stop, "at", 300)
+    with pytest.raises(Interruption):
+        start(monkeypatch, command(tmp_path, callbacks=f"{CHECKPOINT}, 'test_resume_zoo.Stop'"))
+    before = (run_of(tmp_path) / "0.monitor.csv").read_bytes()
+
+    def refuse(*args, **kwargs):
+        raise error("process 7 on another host trains in this folder")
+
+    monkeypatch.setattr(CGP, "resume", refuse)
+    with pytest.raises(SystemExit, match=r"^Error: process 7 on another host trains in this folder$"):
+        main([str(run_of(tmp_path))])
+    assert (run_of(tmp_path) / "0.monitor.csv").read_bytes() == before
 
 
 def test_a_run_without_states_is_as_it_was_before(monkeypatch, tmp_path):

@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import inspect
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -187,6 +188,59 @@ def test_trials_of_optuna_save_no_states(tmp_path):
     assert experiment.setup_experiment() is None
     experiment.hyperparameters_optimization()
     assert [path for path in tmp_path.rglob("*") if path.name == "state"] == []
+
+
+# What rl_zoo3's enjoy and record_video replace in models that another version of Python saved
+CUSTOM_OBJECTS = {"learning_rate": 0.0, "lr_schedule": lambda _: 0.0, "clip_range": lambda _: 0.0}
+
+
+@pytest.fixture
+def save_with_lost_schedules(monkeypatch, tmp_path):
+    """Save a model whose learning rates are functions of a module that is missing when the model is loaded."""
+
+    def save(learning_rate="constant", actor_learning_rate="constant"):
+        (tmp_path / "lost_module.py").write_text("def constant(progress_remaining): return 1e-3")
+        with monkeypatch.context() as patch:
+            patch.syspath_prepend(tmp_path)
+            module = importlib.import_module("lost_module")
+            rates = dict(learning_rate=learning_rate, actor_learning_rate=actor_learning_rate)
+            rates = {name: getattr(module, rate) if isinstance(rate, str) else rate for name, rate in rates.items()}
+            model = CGP("MlpPolicy", "Pendulum-v1", seed=0, **TINY, **rates)
+            model.save(tmp_path / "model")
+        del sys.modules["lost_module"]
+        return model, tmp_path / "model"
+
+    return save
+
+
+def test_custom_objects_of_rl_zoo3_replace_an_actors_schedule_that_cannot_be_loaded(save_with_lost_schedules):
+    model, path = save_with_lost_schedules()
+    with pytest.raises(ModuleNotFoundError, match="lost_module"):
+        CGP.load(path)
+    loaded = CGP.load(path, custom_objects=CUSTOM_OBJECTS)
+    observations = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    assert np.array_equal(loaded.predict(observations)[0], model.predict(observations)[0])
+    assert "actor_learning_rate" not in CUSTOM_OBJECTS
+
+
+def test_an_actors_rate_among_the_users_custom_objects_is_taken(save_with_lost_schedules):
+    _, path = save_with_lost_schedules(learning_rate=1e-3)
+    loaded = CGP.load(path, custom_objects=CUSTOM_OBJECTS | {"actor_learning_rate": 2e-4})
+    assert loaded.actor_learning_rate == 2e-4
+    with pytest.raises(ModuleNotFoundError, match="lost_module"):
+        CGP.load(path, custom_objects={"clip_range": 0.0})
+
+
+def test_enjoy_shows_a_model_whose_schedules_cannot_be_loaded(save_with_lost_schedules, monkeypatch, tmp_path, capsys):
+    _, path = save_with_lost_schedules()
+    run = tmp_path / "logs" / "cgp" / "Pendulum-v1_1"
+    run.mkdir(parents=True)
+    path.with_suffix(".zip").rename(run / "Pendulum-v1.zip")
+    zoo.register()
+    arguments = f"enjoy.py --algo cgp --env Pendulum-v1 -f {tmp_path}/logs --no-render -n 3 --custom-objects --device cpu"
+    monkeypatch.setattr(sys, "argv", arguments.split())
+    importlib.import_module("rl_zoo3.enjoy").enjoy()
+    assert "Loading" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("n_actions", [1, 6])

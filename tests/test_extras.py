@@ -1,0 +1,71 @@
+"""The extras: what a plain install imports, what works in it, and errors that name the extra."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sb3_cgp.common.extras import import_from_extra
+from sb3_cgp.zoo import register
+from sb3_cgp.zoo.resume import main
+
+ROOT = Path(__file__).parents[1]
+EXTRAS = ("huggingface_sb3", "matplotlib", "onnx", "onnxruntime", "onnxscript", "optuna", "pandas", "pydantic", "rl_zoo3")
+EXTRAS += ("safetensors", "sb3_contrib", "scipy", "tensorboard", "tqdm", "yaml")
+
+
+def python(code: str) -> str:
+    """Run code in another process; return its output."""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_package_imports_nothing_that_sb3_does_not_but_filelock():
+    # SB3 itself imports TensorBoard, Matplotlib and pandas where they are installed
+    loaded = python(
+        "import sys, stable_baselines3; before = set(sys.modules)\n"
+        "import sb3_cgp; names = {name.partition('.')[0] for name in set(sys.modules) - before}\n"
+        "print(*sorted(names - sys.stdlib_module_names))"
+    ).split()
+    assert "sb3_cgp" in loaded
+    assert set(loaded) <= {"sb3_cgp", "filelock"}
+
+
+def test_without_the_extras_a_model_is_trained_saved_and_resumed(tmp_path):
+    code = f"""
+import sys
+for name in {EXTRAS}:
+    sys.modules[name] = None
+from sb3_cgp import CGP, TrainingCheckpointCallback
+arguments = dict(learning_starts=5, batch_size=4, buffer_size=100, cem_samples=8, cem_elites=2)
+checkpoint = TrainingCheckpointCallback(save_freq=20, path={str(tmp_path / "states")!r})
+model = CGP("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[4]), **arguments).learn(30, callback=checkpoint)
+model.save({str(tmp_path / "model")!r})
+assert CGP.load({str(tmp_path / "model")!r}).num_timesteps == 30
+resumed = CGP.resume({str(tmp_path / "states")!r}, "Pendulum-v1")
+print("resumed at", resumed.num_timesteps)
+"""
+    assert "resumed at 30" in python(code)
+
+
+@pytest.mark.parametrize("missing", ["rl_zoo3", "rl_zoo3.utils"])
+def test_registration_and_resumption_without_rl_zoo3_name_the_extra(missing, monkeypatch, tmp_path):
+    for name in [name for name in sys.modules if name.partition(".")[0] == "rl_zoo3"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, missing, None)
+    remedy = (
+        rf'needs {missing}, which is not installed: pip install "sb3-cgp\[zoo\]" \(in a clone: pip install -e "\.\[zoo\]"\)'
+    )
+    with pytest.raises(ImportError, match=f"Registering CGP in rl_zoo3 {remedy}"):
+        register()
+    with pytest.raises(SystemExit, match=f"Error: Resuming a run of rl_zoo3 {remedy}"):
+        main([str(tmp_path)])
+
+
+def test_a_module_that_fails_otherwise_fails_as_ever(monkeypatch, tmp_path):
+    (tmp_path / "broken_module.py").write_text("raise ImportError('another reason')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ImportError, match=r"^another reason$"):
+        import_from_extra("broken_module", "zoo", "A test")
