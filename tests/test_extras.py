@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_cgp.common.extras import import_from_extra
+from sb3_cgp.common.extras import import_from_extra, require_from_extra
 from sb3_cgp.zoo import register
 from sb3_cgp.zoo.resume import main
 
@@ -69,3 +69,11 @@ def test_a_module_that_fails_otherwise_fails_as_ever(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ImportError, match=r"^another reason$"):
         import_from_extra("broken_module", "zoo", "A test")
+
+
+def test_a_package_that_is_required_is_not_imported(monkeypatch, tmp_path):
+    (tmp_path / "package_of_an_extra.py").write_text("raise AssertionError('it was imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    require_from_extra("package_of_an_extra", "zoo", "A test")
+    with pytest.raises(ImportError, match=r'A test needs missing_package, .* -e "\.\[zoo\]"'):
+        require_from_extra("missing_package", "zoo", "A test")

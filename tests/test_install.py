@@ -263,6 +263,7 @@ def test_the_hook_of_a_plain_install_is_silent(plain):
     [
         ("import sb3_cgp.zoo; sb3_cgp.zoo.register()", "zoo", "rl_zoo3"),
         ("from sb3_cgp.zoo.resume import main; main(['logs/cgp/Pendulum-v1_1'])", "zoo", "rl_zoo3"),
+        (f"import sys; sys.path.append({str(ROOT)!r}); import benchmark.report", "zoo", "rl_zoo3"),
         ("from sb3_cgp import CGP; CGP.load_weights('export')", "export", "safetensors"),
         ("from sb3_cgp import CGP; CGP('MlpPolicy', 'Pendulum-v1', buffer_size=10).export('export')", "export", "safetensors"),
     ],

@@ -1,6 +1,7 @@
-"""Imports of packages that only an extra of sb3-cgp installs."""
+"""Packages that only an extra of sb3-cgp installs."""
 
 import importlib
+import importlib.util
 from types import ModuleType
 
 
@@ -17,7 +18,24 @@ def import_from_extra(name: str, extra: str, purpose: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        raise ImportError(
-            f'{purpose} needs {error.name}, which is not installed: pip install "sb3-cgp[{extra}]" '
-            f'(in a clone: pip install -e ".[{extra}]")'
-        ) from error
+        raise _not_installed(error.name, extra, purpose) from error
+
+
+def require_from_extra(name: str, extra: str, purpose: str) -> None:
+    """
+    Check that a package is installed, without importing it.
+
+    :param name: name of the package
+    :param extra: name of the extra that installs the package
+    :param purpose: what needs the package; it begins the error's sentence
+    :raises ImportError: if the package is not installed; it names the extra
+    """
+    if importlib.util.find_spec(name) is None:
+        raise _not_installed(name, extra, purpose)
+
+
+def _not_installed(name: str | None, extra: str, purpose: str) -> ImportError:
+    return ImportError(
+        f'{purpose} needs {name}, which is not installed: pip install "sb3-cgp[{extra}]" '
+        f'(in a clone: pip install -e ".[{extra}]")'
+    )
