@@ -17,7 +17,7 @@ from rl_zoo3 import ALGOS
 from benchmark.common.records import configuration_in_words, run_key
 from benchmark.sweeps.random_actions import NAME as RANDOM
 from benchmark.sweeps.sweep_files import Hyperparams, Inclusion, Method, SweepError, SweepFile, read_yaml, validated
-from sb3_cgp.zoo.folders import hyperparams_folder
+from sb3_cgp.zoo.registration import hyperparams_folder
 
 METHODS_FILE = "methods.yml"
 # What rl_zoo3 takes from an entry of its YAML files for itself, but for the steps; the rest are the algorithm's arguments
