@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_cgp.common.episodes import end_last_episode
 from sb3_cgp.common.rules import require
 from sb3_cgp.resumption.environments import environment_state, restore_environment, why_not_restorable
 from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
@@ -101,7 +102,7 @@ def begin_new_episode(model: "ResumableAlgorithm", state: State) -> None:
     )
     model._last_obs = None
     assert model.replay_buffer is not None
-    _end_last_episode(model.replay_buffer)
+    end_last_episode(model.replay_buffer)
     normalizer = model.get_vec_normalize_env()
     if normalizer is not None and state["statistics"] is not None:
         set_plain_attributes(normalizer, state["statistics"])
@@ -178,20 +179,6 @@ def _row_arrays(buffer: ReplayBuffer) -> Iterator[tuple[str, Any]]:
             is_array = isinstance(field, th.Tensor) or (isinstance(field, np.ndarray) and field.dtype != object)
             if is_array and field.ndim > 1 and len(field) == buffer.buffer_size:
                 yield path, field
-
-
-def _end_last_episode(buffer: ReplayBuffer) -> None:
-    """Keep what is stored next from being taken for the rest of the last episode, where the buffer looks beyond a row."""
-    last = buffer.pos - 1
-    if isinstance(buffer, HerReplayBuffer):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            buffer.truncate_last_trajectory()
-    elif isinstance(buffer, NStepReplayBuffer):
-        buffer.timeouts[last] = np.logical_not(buffer.dones[last])
-        buffer.dones[last] = True
-    elif buffer.optimize_memory_usage:
-        buffer.dones[last] = True
 
 
 def _callback_state(callback: BaseCallback, training_env: VecEnv) -> State:
