@@ -8,9 +8,10 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_cgp.common.rules import require, require_choice
+from sb3_cgp.core import cgp as core
 from sb3_cgp.core.policies import CGPPolicy
 from sb3_cgp.diagnostics import DiagnosticsAlgorithm
 from sb3_cgp.export.read import ExportedPolicy, load_weights
@@ -19,12 +20,13 @@ from sb3_cgp.fast.cuda_graph_algorithm import CudaGraphAlgorithm
 from sb3_cgp.fast.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_cgp.fast.replay import LeanReplayAlgorithm
 from sb3_cgp.fast.scoring import SCORING_DTYPES
+from sb3_cgp.guards.algorithm import GuardedAlgorithm
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
 
 SelfCGP = TypeVar("SelfCGP", bound="CGP")
 
 
-class CGP(ResumableAlgorithm, DiagnosticsAlgorithm, CudaGraphAlgorithm, LeanReplayAlgorithm):
+class CGP(ResumableAlgorithm, DiagnosticsAlgorithm, CudaGraphAlgorithm, GuardedAlgorithm, LeanReplayAlgorithm, core.CGP):
     """
     Cross-Entropy Guided Policies (CGP).
 
@@ -185,6 +187,36 @@ class CGP(ResumableAlgorithm, DiagnosticsAlgorithm, CudaGraphAlgorithm, LeanRepl
         require(given is None, "policy_kwargs['cem_dtype']", given, "given as `cem_dtype`, outside `policy_kwargs`")
         super()._setup_model()
         self.policy.cem_dtype = self.cem_dtype  # type: ignore[assignment]
+
+    def train_policy(
+        self: SelfCGP,
+        max_steps: int = 100_000,
+        batch_size: int | None = None,
+        callback: MaybeCallback = None,
+        progress_bar: bool = False,
+    ) -> SelfCGP:
+        """
+        Train the policy to convergence on the critics and the replay buffer as they are (the paper's offline training).
+
+        It has converged when the loss, averaged over rounds of 1,000 gradient steps, has not fallen below its lowest
+        value by more than 5 % for 5 rounds in a row. ``learn`` calls it in offline training; call it yourself on a
+        loaded model with a loaded replay buffer (and, if it was trained with ``VecNormalize``, its environment set).
+
+        Callbacks see each gradient step as a step in which no environment moves: ``num_timesteps`` does not change, no
+        episode ends, rewards are 0. Values are logged at ``num_timesteps`` plus the number of gradient steps. A callback
+        that stops the training within its first round leaves CEM to act.
+
+        :param max_steps: largest number of gradient steps
+        :param batch_size: observations per gradient step, by default the model's
+        :param callback: callback(s) called at every gradient step; the training stops when one returns False
+        :param progress_bar: Display a progress bar using tqdm and rich.
+        :return: the model, whose ``predict`` then asks the network that ``inference`` names
+        :raises ValueError: if there is no policy loss or no data, if observations are not normalised and the critics have
+            learnt from normalised ones, or if a loss is NaN or infinite
+        """
+        with self._explaining_errors():
+            self._check_normalisation()
+            return super().train_policy(max_steps, batch_size, callback, progress_bar)
 
     @classmethod
     def load(

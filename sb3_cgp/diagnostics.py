@@ -1,13 +1,11 @@
 """Diagnostics of the policy, logged beside the losses: how certain CEM is, and how well the actor does in comparison."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_cgp.common.random_state import preserved_random_state
 from sb3_cgp.common.rules import require
 from sb3_cgp.core.cgp import CGP
 from sb3_cgp.core.policies import CGPPolicy
@@ -46,21 +44,6 @@ def policy_diagnostics(policy: CGPPolicy, observations: PyTorchObs, has_actor: b
         values["train/actor_cem_distance"] = distance.item()
         values["train/cem_q_advantage"] = (q_values - actor_q_values).mean().item()
     return values
-
-
-@contextmanager
-def preserved_random_state(device: th.device) -> Iterator[None]:
-    """
-    Restore the states of NumPy's and PyTorch's global generators at the end of a ``with`` block.
-
-    :param device: the device whose generator is restored along with the CPU's
-    """
-    state = np.random.get_state()  # noqa: NPY002  # The generator of SB3's replay buffers
-    with th.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-        try:
-            yield
-        finally:
-            np.random.set_state(state)  # noqa: NPY002
 
 
 class DiagnosticsAlgorithm(CGP):

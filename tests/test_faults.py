@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 from trainings import Do
 
 from sb3_cgp import CGP
-from sb3_cgp.guards.faults import BoundsWatch
+from sb3_cgp.guards.transitions import BoundsWatch
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
 from sb3_cgp.resumption.store import StateStore
 
@@ -115,7 +115,7 @@ def ignore_termination(*values):
 
 def test_workers_that_do_not_heed_sigterm_are_ended_too(monkeypatch):
     """Forked after pygame has begun, they take SIGTERM for an event, and hold the dead one's pipe open."""
-    monkeypatch.setattr("sb3_cgp.guards.faults.GRACE", 0.5)
+    monkeypatch.setattr("sb3_cgp.guards.workers.GRACE", 0.5)
     env = SubprocVecEnv([lambda: Failing(ignore_termination, at=1), lambda: Failing(kill_worker)], start_method="fork")
     with pytest.raises(RuntimeError, match="worker 1"):
         CGP("MlpPolicy", env, **SMALL).learn(300)
@@ -135,6 +135,15 @@ def test_a_worker_that_dies_during_a_gradient_step_is_named():
     model = CGP("MlpPolicy", env, **SMALL)
     with pytest.raises(RuntimeError, match=r"worker 1 .* was killed by signal 15"):
         model.learn(300, Do(20, env.processes[1].terminate))
+    assert_buried(env)
+
+
+def test_a_worker_that_dies_in_a_nested_training_is_named_alone():
+    env = subproc(None, None, None)
+    outer, inner = (CGP("MlpPolicy", env, **SMALL) for _ in range(2))
+    message = r"of 3 workers, worker 1 \(process \d+\) was killed by signal 15 \(Terminated\)\. An"
+    with pytest.raises(RuntimeError, match=message):
+        outer.learn(300, Do(20, lambda: inner.learn(300, Do(20, env.processes[1].terminate))))
     assert_buried(env)
 
 

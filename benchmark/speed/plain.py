@@ -7,8 +7,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_cgp.core.cem import Selection
-from sb3_cgp.core.policies import CGPPolicy
-from sb3_cgp.core.policies import repeated_q_score
+from sb3_cgp.core.policies import CGPPolicy, repeated_q_score
 
 
 class PlainPolicy(CGPPolicy):

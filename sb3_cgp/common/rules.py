@@ -5,11 +5,6 @@ from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any
 
-import numpy as np
-from gymnasium import spaces
-
-LARGEST_FLOAT32 = np.finfo(np.float32).max
-
 
 def require(condition: bool, name: str, value: Any, allowed: str) -> None:
     """
@@ -64,35 +59,3 @@ def require_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
     """
     choices = list(choices)
     require(value in choices, name, value, "one of " + ", ".join(repr(choice) for choice in choices))
-
-
-def check_action_space(action_space: spaces.Space) -> None:
-    """
-    Check that CEM can search an action space: a box, bounded in every dimension.
-
-    :param action_space: the environment's action space
-    :raises ValueError: if it is of another kind, unbounded or empty
-    """
-    require(isinstance(action_space, spaces.Box), "action_space", action_space, "a gymnasium.spaces.Box")
-    low, high = action_space.low, action_space.high  # type: ignore[attr-defined]
-    bounded = low.size > 0 and bool(np.all(np.isfinite(low)) and np.all(np.isfinite(high)) and np.all(low < high))
-    require(bounded, "action_space", action_space, "bounded: finite low < high in every dimension, and at least one")
-
-
-def check_finite(name: str, values: Any, timestep: int) -> None:
-    """
-    Stop the training at the first value that the environment returns and that is NaN or infinite, in float32.
-
-    :param name: what the values are
-    :param values: an array, or arrays by key
-    :param timestep: the environment step
-    :raises ValueError: if a value is NaN or infinite
-    """
-    for key, array in values.items() if isinstance(values, dict) else [(None, values)]:
-        # False for NaN, too
-        if not np.all(np.abs(array) <= LARGEST_FLOAT32):
-            which = name if key is None else f"{name} `{key}`"
-            raise ValueError(
-                f"The environment returned a NaN or infinite (in float32) {which} at environment step {timestep}: {array}. "
-                "It was not stored, and the networks are as before it."
-            )

@@ -4,6 +4,7 @@ from typing import Any
 
 from sb3_cgp.common.rules import require, require_choice, require_count, require_number
 from sb3_cgp.common.sb3_arguments import check_learning_rate, check_off_policy_arguments
+from sb3_cgp.common.spaces import check_action_space
 
 
 def check_cem(iterations: Any, samples: Any, elites: Any, result: Any, prefix: str = "") -> None:
@@ -28,6 +29,7 @@ def check_arguments(model: Any, policy_losses: tuple[str, ...]) -> None:
     :raises ValueError: naming the first argument that breaks a rule, its value and what is allowed
     """
     check_off_policy_arguments(model)
+    check_action_space(model.action_space)
     check_cem(model.cem_iterations, model.cem_samples, model.cem_elites, model.cem_result, prefix="cem_")
     for name in ("policy_delay", "target_update_interval"):
         require_count(name, getattr(model, name))

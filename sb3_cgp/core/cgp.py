@@ -29,7 +29,6 @@ SelfCGP = TypeVar("SelfCGP", bound="CGP")
 class CGP(OffPolicyAlgorithm):
     """
     Cross-Entropy Guided Policies (CGP): the algorithm of the paper, without the wings of :class:`sb3_cgp.CGP`.
-
     Learns Q-functions by TD3's objective, with actions picked by the Cross-Entropy Method (CEM), and distils CEM into
     an actor that acts at inference for the price of one forward pass.
 

@@ -15,7 +15,8 @@ import numpy as np
 import torch as th
 
 from sb3_cgp.common.extras import import_from_extra
-from sb3_cgp.common.rules import check_action_space, require, require_number
+from sb3_cgp.common.rules import require, require_number
+from sb3_cgp.common.spaces import check_action_space
 from sb3_cgp.export.description import (
     ACTION_DTYPES,
     DESCRIPTION_FILE,

@@ -1,1 +1,5 @@
-"""Errors that name the cause where an environment fails or a value is not a number."""
+"""Environments that fail, values that are no numbers, and wrong use that would be silent, or blamed on something else."""
+
+from sb3_cgp.guards.algorithm import GuardedAlgorithm
+
+__all__ = ["GuardedAlgorithm"]

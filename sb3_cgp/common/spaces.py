@@ -1,0 +1,34 @@
+"""The rule on action spaces that acting, training and exported policies share."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_cgp.common.rules import require
+
+
+def check_action_space(action_space: spaces.Space[Any]) -> None:
+    """
+    Check that actions can be scaled to [-1, 1] and back: a Box of floating point numbers, bounded in every dimension.
+
+    :param action_space: the environment's action space
+    :raises ValueError: if it is of another kind or dtype, empty, unbounded, or so wide that ``high - low`` overflows its dtype
+    """
+    require(isinstance(action_space, spaces.Box), "action_space", action_space, "a gymnasium.spaces.Box")
+    assert isinstance(action_space, spaces.Box)
+    require(
+        np.issubdtype(action_space.dtype, np.floating),
+        "action_space",
+        action_space,
+        "of a floating point dtype, such as float32, as the replay buffer stores actions scaled to [-1, 1] in it: give the "
+        "environment such a space, and let it round the actions",
+    )
+    low, high = action_space.low, action_space.high
+    is_bounded = low.size > 0 and bool(np.all(np.isfinite(low)) and np.all(np.isfinite(high)) and np.all(low < high))
+    require(is_bounded, "action_space", action_space, "bounded: finite low < high in every dimension, and at least one")
+    # SB3 scales actions in the space's own dtype
+    with np.errstate(over="ignore"):
+        is_scalable = bool(np.all(np.isfinite(high - low)))
+    allowed = f"of bounds whose difference `high - low` is finite in {action_space.dtype}: give the environment closer bounds"
+    require(is_scalable, "action_space", action_space, allowed)

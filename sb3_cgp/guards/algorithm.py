@@ -1,0 +1,33 @@
+"""All guards in one class, to be mixed into an off-policy algorithm of SB3's."""
+
+from sb3_cgp.guards.dummy_vec_env import DummyVecEnvGuard
+from sb3_cgp.guards.episodes import EpisodeGuard
+from sb3_cgp.guards.explanations import ExplanationGuard
+from sb3_cgp.guards.learning_starts import LearningStartsGuard
+from sb3_cgp.guards.losses import LossGuard
+from sb3_cgp.guards.networks import NetworkGuard
+from sb3_cgp.guards.normalisation import NormalisationGuard
+from sb3_cgp.guards.parts import PartsGuard
+from sb3_cgp.guards.transitions import TransitionGuard
+from sb3_cgp.guards.workers import WorkerGuard
+
+
+class GuardedAlgorithm(
+    WorkerGuard,
+    ExplanationGuard,
+    DummyVecEnvGuard,
+    NormalisationGuard,
+    PartsGuard,
+    # Looks at the first observations when the next one has reset the environment
+    TransitionGuard,
+    EpisodeGuard,
+    LossGuard,
+    NetworkGuard,
+    LearningStartsGuard,
+):
+    """
+    An algorithm that notices faults of environments and wrong use, and names them or does the right thing.
+
+    It comes before an algorithm among a class's bases: ``class GuardedTD3(GuardedAlgorithm, TD3)``. Each base is a guard of
+    its own, and works without the others.
+    """

@@ -1,0 +1,114 @@
+"""Observations that a ``DummyVecEnv`` would change before anything else sees them."""
+
+import copy
+import weakref
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any, TypeVar
+
+import gymnasium as gym
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_cgp.guards.explanations import OLD_RESET
+from sb3_cgp.guards.transitions import check_shape
+
+SelfDummyVecEnvGuard = TypeVar("SelfDummyVecEnvGuard", bound="DummyVecEnvGuard")
+
+
+class DummyVecEnvGuard(OffPolicyAlgorithm):
+    """
+    An algorithm that sees the observations of a ``DummyVecEnv`` as its environments return them.
+
+    It refuses those that NumPy would broadcast to the array in which a ``DummyVecEnv`` collects them. It copies an episode's
+    final one before the environment's ``reset`` can overwrite it.
+    """
+
+    def learn(self: SelfDummyVecEnvGuard, *args: Any, **kwargs: Any) -> SelfDummyVecEnvGuard:
+        """
+        Learn from the observations that the environments return.
+
+        :param args: the algorithm's own arguments
+        :param kwargs: the algorithm's own arguments
+        :return: the trained model
+        :raises ValueError: if an observation is of a wrong shape, or ``reset`` has the old API
+        """
+        env = None if self.env is None else self.env.unwrapped
+        if not isinstance(env, DummyVecEnv):
+            return super().learn(*args, **kwargs)
+        with ExitStack() as stack:
+            # A private method, as nothing outside of the environment sees an observation before it is collected
+            stack.enter_context(_shadowed(env, "_save_obs", _CheckedObservations(env, self).save))
+            for index, each in enumerate(env.envs):
+                stack.enter_context(_shadowed(each, "reset", _KeptFinalObservation(env, index, each.reset).reset))
+            return super().learn(*args, **kwargs)
+
+
+class _CheckedObservations:
+    """
+    Check each observation before a ``DummyVecEnv`` collects it. A copy that is made during a training checks nothing.
+
+    :param env: the environment
+    :param model: the model that is learning
+    """
+
+    def __init__(self, env: DummyVecEnv, model: OffPolicyAlgorithm):
+        self._env = env
+        self._model: weakref.ref[OffPolicyAlgorithm] | None = weakref.ref(model)
+
+    def save(self, env_idx: int, obs: Any) -> None:
+        """
+        Collect an observation.
+
+        :param env_idx: the environment's index
+        :param obs: its observation
+        :raises ValueError: if it is of a wrong shape, or ``reset`` has the old API
+        """
+        model = None if self._model is None else self._model()
+        if model is not None:
+            if not isinstance(self._env.reset_infos[env_idx], dict):
+                raise ValueError(OLD_RESET)
+            check_shape("observation", obs, self._env.observation_space, None, model.num_timesteps)
+        type(self._env)._save_obs(self._env, env_idx, obs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_model": None}
+
+
+class _KeptFinalObservation:
+    """
+    Copy an episode's final observation before the environment is reset, which may overwrite it.
+
+    :param vec_env: the environment's ``DummyVecEnv``
+    :param index: the environment's index in it
+    :param reset: the environment's own method
+    """
+
+    def __init__(self, vec_env: DummyVecEnv, index: int, reset: Any):
+        self._vec_env, self._index, self._reset = vec_env, index, reset
+
+    def reset(self, **kwargs: Any) -> Any:
+        """
+        Reset the environment.
+
+        :param kwargs: the arguments of its own method
+        :return: what that returns
+        """
+        info = self._vec_env.buf_infos[self._index]
+        if "terminal_observation" in info:
+            info["terminal_observation"] = copy.deepcopy(info["terminal_observation"])
+        return self._reset(**kwargs)
+
+
+@contextmanager
+def _shadowed(owner: DummyVecEnv | gym.Env, name: str, method: Any) -> Iterator[None]:
+    """Put a method in the place of an object's own for a time, in which a nested training may do the same."""
+    before = vars(owner).get(name)
+    setattr(owner, name, method)
+    try:
+        yield
+    finally:
+        if before is None:
+            delattr(owner, name)
+        else:
+            setattr(owner, name, before)

@@ -1,0 +1,231 @@
+"""Episodes that end unseen: an environment that was reset or stepped elsewhere, or a step that was not stored."""
+
+import operator
+import warnings
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from sb3_cgp.common.episodes import end_last_episode
+from sb3_cgp.guards.observations import (
+    continues_last_episode,
+    copy_observations,
+    count_observations,
+    position_of,
+    same_observations,
+)
+
+
+class EpisodeGuard(OffPolicyAlgorithm):
+    """
+    An algorithm that stores only steps that were made, and lets no episode of its replay buffer run into the next one.
+
+    Before each action it compares where the environment is with where its own last step left it. A new episode starts, and
+    the buffer's last one ends, where they differ: after an evaluation or another training on the same environment, and
+    where a callback or an exception ended a training before the last step was stored.
+    """
+
+    # Where the model's own last step, or its reset, left the environment; None where that is unknown, as after `load`
+    _left_env_at: "_EnvMark | None" = None
+    # The step of the training's own that is not stored yet
+    _own_step: "_OwnStep | None" = None
+    _has_warned_of_moves: bool = False
+
+    def _setup_learn(
+        self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any, **kwargs: Any
+    ) -> tuple[int, Any]:
+        if self._env_has_moved() or count_observations(self._original_last_obs) != self.n_envs:
+            # SB3 resets the environment then
+            self._last_obs = None
+        is_reset = reset_num_timesteps or self._last_obs is None
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
+        self._has_warned_of_moves = False
+        if is_reset:
+            self._note_reset()
+        elif self.replay_buffer is not None and not continues_last_episode(self.replay_buffer, self._original_last_obs):
+            end_last_episode(self.replay_buffer)
+        return result
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Set the environment, see SB3's method.
+
+        :param env: The environment for learning a policy
+        :param force_reset: Force call to ``reset()`` before training. With False, the environment must be in the state that
+            the model's last observation is of. A ``DummyVecEnv`` that is not is reset when ``learn`` starts.
+        """
+        previous = None if self.env is None else self.env.unwrapped
+        super().set_env(env, force_reset)
+        assert self.env is not None
+        if self.env.unwrapped is not previous:
+            self._left_env_at = None
+
+    def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """
+        Collect experiences and store them into the replay buffer, see SB3's method.
+
+        :param env: The training environment
+        :param callback: Callback that will be called at each step (and at the beginning and end of the rollout)
+        :param args: the further arguments of SB3's method
+        :param kwargs: the further arguments of SB3's method
+        :return: the numbers of steps and episodes, and whether to go on
+        """
+        return super().collect_rollouts(env, _StepObserver(callback, self), *args, **kwargs)  # type: ignore[arg-type]
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if self._env_has_moved() or (self._left_env_at is None and self._env_differs()):
+            self._begin_episode(action_noise)
+        actions = super()._sample_action(learning_starts, action_noise, n_envs)
+        # From here on the environment may be anywhere if an exception ends the step
+        self._own_step = _OwnStep()
+        return actions
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        own_step, normalizer = self._own_step, self._vec_normalize_env
+        if own_step is not None and own_step.position is not None and normalizer is not None:
+            # A callback may have stepped the same environment since, and SB3 asks VecNormalize for the last step's values
+            normalizer.old_obs, normalizer.old_reward = own_step.normalizer_values
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        # The environment may return an array that its next step overwrites
+        self._last_obs = copy_observations(self._last_obs)
+        position = None if own_step is None else own_step.position
+        self._left_env_at = None if position is None else _EnvMark(self._last_obs, position)
+        self._own_step = None
+
+    @property
+    def _original_last_obs(self) -> Any:
+        return self._last_obs if self._vec_normalize_env is None else self._last_original_obs
+
+    def _note_step(self) -> None:
+        """Remember where the model's own step has left the environment, before callbacks are told of it."""
+        assert self.env is not None
+        normalizer = self._vec_normalize_env
+        values = None if normalizer is None else (normalizer.old_obs, normalizer.old_reward)
+        self._own_step = _OwnStep(position_of(self.env), values)
+
+    def _note_reset(self) -> None:
+        """End the replay buffer's last episode after a reset, and remember where the environment is."""
+        assert self.env is not None
+        self._last_obs = copy_observations(self._last_obs)
+        self._left_env_at = _EnvMark(self._last_obs, position_of(self.env))
+        self._own_step = None
+        if self.replay_buffer is not None:
+            end_last_episode(self.replay_buffer)
+
+    def _begin_episode(self, action_noise: ActionNoise | None) -> None:
+        """Reset an environment that was reset or stepped by others during the training."""
+        if not self._has_warned_of_moves:
+            self._has_warned_of_moves = True
+            warnings.warn(
+                f"The training environment was reset or stepped outside of this training, at environment step "
+                f"{self.num_timesteps}: it is reset, and the episode that was interrupted ends there. Evaluate on an "
+                "environment of its own, to keep episodes whole. This is said once in a training.",
+                stacklevel=2,
+            )
+        assert self.env is not None
+        self._last_obs = self.env.reset()  # type: ignore[assignment]
+        self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._vec_normalize_env.get_original_obs()
+        if action_noise is not None:
+            action_noise.reset()
+        self._note_reset()
+        self._check_first_observations()
+
+    def _check_first_observations(self) -> None:
+        """Check the observations that an episode starts with, where the algorithm has such checks."""
+
+    def _env_has_moved(self) -> bool:
+        """Return whether the environment is known to be elsewhere than where the model's last stored step left it."""
+        mark = self._left_env_at
+        if self._own_step is not None:
+            # A step that was made and not stored
+            return True
+        if mark is None or self.env is None or self._last_obs is None or self._last_obs is not mark.last_obs:
+            # Nothing is known, or the last observation was set on purpose, as in resuming a training
+            return False
+        position = position_of(self.env)
+        return len(position) != len(mark.position) or not all(map(operator.is_, position, mark.position))
+
+    def _env_differs(self) -> bool:
+        """Return whether the environment shows other observations than the model's last ones, as far as it shows any."""
+        assert self.env is not None
+        bare = self.env if self._vec_normalize_env is None else self._vec_normalize_env.venv
+        # Within wrappers of other kinds, observations may differ rightly
+        if not isinstance(bare, DummyVecEnv) or (
+            self._vec_normalize_env is not None and self._vec_normalize_env is not self.env
+        ):
+            return False
+        last = self._original_last_obs
+        shown = bare.buf_obs if isinstance(last, dict) else bare.buf_obs.get(None)  # type: ignore[call-overload]
+        return shown is not None and not same_observations(shown, last)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_left_env_at", "_own_step", "_has_warned_of_moves"]
+
+
+class _EnvMark:
+    """
+    A moment in an environment's run.
+
+    :param last_obs: the model's last observations at the time
+    :param position: the objects that :func:`~sb3_cgp.guards.observations.position_of` returned at the time
+    """
+
+    def __init__(self, last_obs: Any, position: tuple[Any, ...]):
+        self.last_obs, self.position = last_obs, position
+
+
+class _OwnStep:
+    """
+    A step of the training's own.
+
+    :param position: the objects that :func:`~sb3_cgp.guards.observations.position_of` returned after it; None until then
+    :param normalizer_values: the observations and rewards that ``VecNormalize`` was given, if there is one
+    """
+
+    def __init__(self, position: tuple[Any, ...] | None = None, normalizer_values: Any = None):
+        self.position, self.normalizer_values = position, normalizer_values
+
+
+class _StepObserver:
+    """
+    Stand in for a rollout's callback, to note each step before the callback is told of it.
+
+    SB3 has no other method between a step and its callbacks.
+
+    :param callback: the rollout's callback
+    :param model: the model that is learning
+    """
+
+    def __init__(self, callback: BaseCallback, model: EpisodeGuard):
+        self._callback, self._model = callback, model
+        # The methods that a rollout calls, without a detour
+        self.on_rollout_start, self.on_rollout_end = callback.on_rollout_start, callback.on_rollout_end
+        self.on_step = callback.on_step
+
+    def update_locals(self, locals_: dict[str, Any]) -> None:
+        """
+        Note the step, and update the callback's view of it.
+
+        :param locals_: the local variables of the rollout
+        """
+        self._model._note_step()
+        locals_["callback"] = self._callback
+        self._callback.update_locals(locals_)

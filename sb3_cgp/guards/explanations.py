@@ -1,0 +1,118 @@
+"""Errors of SB3's that name a symptom, and what they mean: the old API, rewards that are no numbers, too few episodes."""
+
+import re
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, TypeVar
+
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+SelfExplanationGuard = TypeVar("SelfExplanationGuard", bound="ExplanationGuard")
+
+OLD_API = (
+    "The environment has the API of Gym before version 0.26. Change it, or wrap it in `shimmy.GymV21CompatibilityV0(env=env)`."
+)
+OLD_RESET = (
+    "The environment's `reset` must take `seed` and `options` and return two values, the observation and a dictionary: "
+    f"`def reset(self, *, seed=None, options=None): ...; return observation, info`. {OLD_API}"
+)
+OLD_STEP = (
+    "The environment's `step` must return five values, `observation, reward, terminated, truncated, info`, where `truncated` "
+    f"means that the episode ran out of time. {OLD_API}"
+)
+NO_INFO = "The environment's `step` must return a dictionary as its last value, `info`; an empty one, `{}`, will do."
+
+
+class ExplanationGuard(OffPolicyAlgorithm):
+    """An algorithm whose ``learn`` explains errors that SB3 raises far from their cause."""
+
+    def learn(self: SelfExplanationGuard, *args: Any, **kwargs: Any) -> SelfExplanationGuard:
+        """
+        Learn, and explain an error of SB3's.
+
+        :param args: the algorithm's own arguments
+        :param kwargs: the algorithm's own arguments
+        :return: the trained model
+        :raises ValueError: naming the cause, and the remedy
+        """
+        with self._explaining_errors():
+            return super().learn(*args, **kwargs)
+
+    @contextmanager
+    def _explaining_errors(self) -> Iterator[None]:
+        """
+        Raise an error that names the cause and the remedy in place of one that does not, as its cause.
+
+        :raises ValueError: in place of SB3's error; other errors pass
+        """
+        try:
+            yield
+        except (TypeError, ValueError, RuntimeError) as error:
+            message = explain(error, self)
+            if message is None:
+                raise
+            raise ValueError(message) from error
+
+
+def explain(error: Exception, model: OffPolicyAlgorithm) -> str | None:
+    """
+    Return what an error means, judged by the function that raised it.
+
+    :param error: the error
+    :param model: the model that was learning
+    :return: the cause and the remedy; None for an error that speaks for itself
+    """
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    reward = _explain_reward(error, frame)
+    if reward is not None:
+        return f"The environment returned a reward that is not a number at environment step {model.num_timesteps}{reward}."
+    if frame.f_code is HerReplayBuffer.sample.__code__ and isinstance(error, RuntimeError):
+        return _explain_no_episode(frame.f_locals["self"], model.learning_starts)
+    # Not an error of the environment's own code, but of its callers: SB3, Gymnasium's wrappers, and this package
+    if frame.f_globals.get("__name__", "").startswith(("stable_baselines3.", "gymnasium.", "sb3_cgp.guards.")):
+        return _explain_old_api(str(error), frame.f_code.co_name)
+    return None
+
+
+def _explain_reward(error: Exception, frame: FrameType) -> str | None:
+    """Return the reward that SB3 could not make a number of, if that was the error."""
+    if frame.f_code is Monitor.step.__code__ and "reward" in frame.f_locals and "item assignment" not in str(error):
+        return f": {frame.f_locals['reward']!r}"
+    if frame.f_code is DummyVecEnv.step_wait.__code__ and "array element" in str(error):
+        return ""
+    return None
+
+
+def _explain_old_api(error: str, function: str) -> str | None:
+    """Explain an error of unpacking what the environment returned, or of calling it."""
+    if re.search(r"values to unpack \(expected 5", error) or ("cannot unpack" in error and function == "step"):
+        return OLD_STEP
+    if re.search(r"values to unpack \(expected 2", error) or ("cannot unpack" in error and function == "reset"):
+        return OLD_RESET
+    if re.search(r"reset\(\) (got an unexpected keyword|takes)", error):
+        return OLD_RESET
+    if "does not support item assignment" in error and function in ("step", "step_wait"):
+        return NO_INFO
+    return None
+
+
+def _explain_no_episode(buffer: HerReplayBuffer, learning_starts: int) -> str:
+    """Explain why a hindsight replay buffer has no whole episode to sample from."""
+    cause = (
+        f"The HerReplayBuffer holds no whole episode of any of the {buffer.n_envs} environment(s), and samples from whole ones"
+    )
+    if buffer.full:
+        return (
+            f"{cause}: its room of {buffer.buffer_size} steps of each environment does not hold a whole episode while another "
+            f"one overwrites it. Raise `buffer_size`, which the environments share, to {2 * buffer.n_envs} x the longest "
+            "episode or more, or limit the episodes' length (`max_episode_steps`)."
+        )
+    return (
+        f"{cause}: it has {buffer.pos} steps of each, and the first episode is longer. `learning_starts` is {learning_starts} "
+        f"and counts the steps of all environments: raise it to {buffer.n_envs} x the longest episode or more."
+    )

@@ -1,0 +1,26 @@
+"""Losses that are NaN or infinite."""
+
+import math
+
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+
+class LossGuard(OffPolicyAlgorithm):
+    """An algorithm, with a method ``_descend``, that takes no optimizer step down a loss that is NaN or infinite."""
+
+    def _descend(self, name: str, loss: th.Tensor) -> None:
+        """
+        Take an optimizer step down a loss.
+
+        :param name: the network's name, "critic" or "actor"
+        :param loss: the loss, a scalar
+        :raises ValueError: if the loss is NaN or infinite; the network stays as it was
+        """
+        value = loss.item()
+        if not math.isfinite(value):
+            raise ValueError(
+                f"The {name} loss is {value} at gradient step {self._n_updates}, environment step {self.num_timesteps}. "
+                f"The {name} is as before that step."
+            )
+        super()._descend(name, loss)  # type: ignore[misc]  # of the algorithm that this class is mixed into

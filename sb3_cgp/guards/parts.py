@@ -1,0 +1,148 @@
+"""Parts of a model that do not fit together: replay buffers and action noise of other environments, a missing buffer."""
+
+import copy
+import io
+import pathlib
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from sb3_cgp.common.rules import require
+from sb3_cgp.common.spaces import check_action_space
+
+
+class PartsGuard(OffPolicyAlgorithm):
+    """
+    An algorithm that adapts its action noise to the number of environments, and refuses a replay buffer that does not fit.
+
+    A model with hindsight replay (HER) can be loaded without an environment, to act.
+    """
+
+    @classmethod
+    def _wrap_env(cls, env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        # SB3's is a static method, which could not call its base class's. It comes before SB3's assertions on the space.
+        wrapped = super()._wrap_env(env, verbose, monitor_wrapper)
+        check_action_space(wrapped.action_space)
+        return wrapped
+
+    def _setup_model(self) -> None:
+        is_her = isinstance(self.replay_buffer_class, type) and issubclass(self.replay_buffer_class, HerReplayBuffer)
+        if self.env is not None or self.replay_buffer is not None or not is_her:
+            super()._setup_model()
+            return
+        # SB3 demands an environment for a buffer of this class. It makes no buffer if there is one.
+        self.replay_buffer = ReplayBuffer(1, spaces.Discrete(1), self.action_space)
+        super()._setup_model()
+        self.replay_buffer = None
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
+        assert self.env is not None, "You must set the environment before calling learn()"
+        self._fit_action_noise(self.env.num_envs)
+        check_action_noise_shape(self.action_noise, self.action_space)
+        if self.replay_buffer is not None:
+            check_replay_buffer(self.replay_buffer, self)
+        result = super()._setup_learn(*args, **kwargs)
+        if self.replay_buffer is None:
+            raise ValueError(
+                f"The value of `replay_buffer` is None: a model with {self.replay_buffer_class} that was loaded without an "
+                f"environment can act, and not learn. Load it with one: `{type(self).__name__}.load(path, env)`."
+            )
+        return result
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load a replay buffer from a pickle file. If it does not fit the model, the model keeps the buffer that it has.
+
+        :param path: Path to the pickled replay buffer.
+        :param truncate_last_traj: When using ``HerReplayBuffer`` with online sampling: whether the last trajectory in the
+            replay buffer was finished. With False, it is continued where the environment is still at its end.
+        :raises ValueError: if the buffer is of other spaces or of another number of environments than the model
+        """
+        previous = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        assert self.replay_buffer is not None
+        try:
+            check_replay_buffer(self.replay_buffer, self)
+        except ValueError:
+            self.replay_buffer = previous
+            raise
+
+    def _fit_action_noise(self, n_envs: int) -> None:
+        """Adapt vectorised action noise to the number of environments, which `load` may have changed."""
+        noise = self.action_noise
+        if not isinstance(noise, VectorizedActionNoise) or len(noise.noises) == n_envs:
+            return
+        base = copy.deepcopy(noise.base_noise)
+        self.action_noise = base if n_envs == 1 else VectorizedActionNoise(base, n_envs)
+
+
+def check_action_noise_shape(noise: ActionNoise | None, action_space: spaces.Space) -> None:
+    """
+    Check that action noise can be added to an action.
+
+    :param noise: the exploration noise, if any; noise of another class than SB3's is not checked
+    :param action_space: the action space
+    :raises ValueError: if the noise is of another shape
+    """
+    base = noise.base_noise if isinstance(noise, VectorizedActionNoise) else noise
+    for name in ("_mu", "_sigma"):
+        # SB3 gives no public access to the mean and the standard deviation
+        shape = np.shape(getattr(base, name, 0.0))
+        allowed = f"noise of the actions' shape, {action_space.shape}, not {shape}"
+        require(_broadcasts_to(shape, action_space.shape or ()), "action_noise", noise, allowed)
+
+
+def check_replay_buffer(buffer: ReplayBuffer, model: OffPolicyAlgorithm) -> None:
+    """
+    Check that a replay buffer fits a model.
+
+    :param buffer: the replay buffer
+    :param model: the model, whose number of environments and spaces are compared with the buffer's
+    :raises ValueError: if they differ
+    """
+    name = type(model).__name__
+    require(
+        buffer.n_envs == model.n_envs,
+        "replay_buffer.n_envs",
+        buffer.n_envs,
+        f"{model.n_envs}, the model's number of environments: load the model with {buffer.n_envs} of them, "
+        f"`{name}.load(path, env)`, or begin with an empty replay buffer",
+    )
+    require(
+        _stores_alike(buffer.observation_space, model.observation_space),
+        "replay_buffer.observation_space",
+        buffer.observation_space,
+        f"of the shape and the kind of dtype of the model's, {model.observation_space}: load the buffer that was saved with "
+        "the model, or begin with an empty one",
+    )
+    # Actions are stored scaled to [-1, 1]: those of other bounds mean other actions
+    require(
+        buffer.action_space == model.action_space,
+        "replay_buffer.action_space",
+        buffer.action_space,
+        f"the model's, {model.action_space}: load the buffer that was saved with the model, or begin with an empty one",
+    )
+
+
+def _stores_alike(space: spaces.Space, other: spaces.Space) -> bool:
+    """Return whether values of two spaces have the same keys and shapes, and are both integers or both floats."""
+    if isinstance(space, spaces.Dict) and isinstance(other, spaces.Dict):
+        return space.keys() == other.keys() and all(_stores_alike(space[key], other[key]) for key in space)
+    if isinstance(space, spaces.Box) and isinstance(other, spaces.Box):
+        return space.shape == other.shape and np.dtype(space.dtype).kind == np.dtype(other.dtype).kind
+    return space == other
+
+
+def _broadcasts_to(shape: tuple[int, ...], other: tuple[int, ...]) -> bool:
+    """Return whether NumPy broadcasts an array of a shape to another one."""
+    try:
+        return np.broadcast_shapes(shape, other) == other
+    except ValueError:
+        return False

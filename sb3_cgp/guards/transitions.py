@@ -1,0 +1,260 @@
+"""
+What is checked of a transition before it is stored: the checks, their list (:func:`make_checks`), and when they are made.
+
+To add a check, write a function of a :class:`Transition` here, and add it to the list.
+"""
+
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs
+
+from sb3_cgp.guards.explanations import OLD_RESET
+
+LARGEST_FLOAT32 = np.finfo(np.float32).max
+
+
+class Transition(NamedTuple):
+    """
+    One step of all N environments, as they returned it, before ``VecNormalize``.
+
+    :param timestep: the environment step, counted over all environments
+    :param observation_space: the observation space
+    :param observations: the new observations, (N, *shape), by key for ``Dict`` spaces
+    :param rewards: the rewards, (N,); None for the first observations of a training
+    :param final_observations: the last observation, (*shape), of each environment whose episode ended
+    :param n_envs: N
+    """
+
+    timestep: int
+    observation_space: spaces.Space
+    observations: VecEnvObs
+    rewards: Any
+    final_observations: list[Any]
+    n_envs: int
+
+
+Check = Callable[[Transition], None]
+
+
+def make_checks(observation_space: spaces.Space) -> list[Check]:
+    """
+    Return the checks of a training's transitions, in their order.
+
+    Each raises a ``ValueError`` that names the value and the step, or warns. None may change the transition.
+
+    :param observation_space: the observation space
+    :return: the checks
+    """
+    return [
+        check_rewards,
+        check_observation_shapes,
+        check_finite_values,
+        BoundsWatch(observation_space),
+        check_final_observations,
+    ]
+
+
+def check_rewards(transition: Transition) -> None:
+    """
+    Refuse rewards that are not one finite number for each environment.
+
+    :param transition: the transition
+    :raises ValueError: naming the shape and the one that is expected, or the values
+    """
+    rewards, timestep = transition.rewards, transition.timestep
+    if rewards is None:
+        return
+    if np.shape(rewards) != (transition.n_envs,):
+        raise _wrong_shape("reward", np.shape(rewards), (transition.n_envs,), timestep)
+    if np.asarray(rewards).dtype.kind not in "biuf":
+        raise ValueError(f"The environment returned a reward that is not a number at environment step {timestep}: {rewards}.")
+
+
+def check_observation_shapes(transition: Transition) -> None:
+    """
+    Refuse observations of another shape than their space's.
+
+    :param transition: the transition
+    :raises ValueError: naming the shape and the one that is expected
+    """
+    check_shape("observation", transition.observations, transition.observation_space, transition.n_envs, transition.timestep)
+
+
+def check_finite_values(transition: Transition) -> None:
+    """
+    Refuse rewards and observations that are NaN or infinite.
+
+    :param transition: the transition
+    :raises ValueError: naming the values
+    """
+    if transition.rewards is not None:
+        check_finite("reward", transition.rewards, transition.timestep)
+    check_finite("observation", transition.observations, transition.timestep)
+
+
+def check_final_observations(transition: Transition) -> None:
+    """
+    Refuse final observations of a wrong shape, or that are NaN or infinite.
+
+    :param transition: the transition
+    :raises ValueError: naming the shape or the values
+    """
+    for observation in transition.final_observations:
+        check_shape("terminal observation", observation, transition.observation_space, None, transition.timestep)
+        check_finite("terminal observation", observation, transition.timestep)
+
+
+class BoundsWatch:
+    """
+    Warn of the first observation that is outside of its space. Nothing in CGP depends on these bounds.
+
+    :param space: the observation space
+    """
+
+    def __init__(self, space: spaces.Space):
+        subspaces = space.spaces if isinstance(space, spaces.Dict) else {None: space}
+        # Integers, such as images, cannot leave the bounds of their type
+        self._boxes = {
+            key: box
+            for key, box in subspaces.items()
+            if isinstance(box, spaces.Box)
+            and np.issubdtype(box.dtype, np.floating)
+            and (box.bounded_below.any() or box.bounded_above.any())
+        }
+
+    def __call__(self, transition: Transition) -> None:
+        """
+        Warn if an observation of a transition is out of bounds, unless that has happened before.
+
+        :param transition: the transition
+        """
+        self.check(transition.observations, transition.timestep)
+
+    def check(self, observation: VecEnvObs, timestep: int) -> None:
+        """
+        Warn if an observation is out of bounds, unless that has happened before.
+
+        :param observation: the observations of all environments, or of one
+        :param timestep: the environment step
+        """
+        for key, box in self._boxes.items():
+            values = observation if key is None else observation[key]  # type: ignore[call-overload]
+            outside = (values < box.low) | (values > box.high)
+            if outside.any():
+                self._warn(key, box, np.asarray(values), outside, timestep)
+                self._boxes = {}
+                return
+
+    @staticmethod
+    def _warn(key: str | None, box: spaces.Box, values: np.ndarray, outside: np.ndarray, timestep: int) -> None:
+        first = tuple(np.argwhere(outside)[0].tolist())
+        # Observations of several environments have an axis more
+        index = first[values.ndim - len(box.shape) :]
+        name = "observation" if key is None else f"observation `{key}`"
+        warnings.warn(
+            f"The environment returned an {name} outside of its observation space at environment step {timestep}: value "
+            f"{values[first]} at index {index}, where the bounds are [{box.low[index]}, {box.high[index]}]. Training goes on, "
+            "as nothing in CGP depends on these bounds. This is said once.",
+            stacklevel=2,
+        )
+
+
+def check_shape(name: str, values: Any, space: spaces.Space, n_envs: int | None, timestep: int) -> None:
+    """
+    Refuse observations of another shape than their space's, which NumPy may broadcast to it.
+
+    :param name: the name of the values, for the error
+    :param values: the observations of all environments, or of one
+    :param space: the observation space
+    :param n_envs: number of environments; None for the observation of one
+    :param timestep: the environment step
+    :raises ValueError: naming the shape and the one that is expected
+    """
+    batch = () if n_envs is None else (n_envs,)
+    for key, subspace in space.spaces.items() if isinstance(space, spaces.Dict) else [(None, space)]:
+        shape, expected = np.shape(values if key is None else values[key]), (*batch, *(subspace.shape or ()))
+        # NumPy may drop leading axes of length 1, or add them: no number is lost or repeated
+        if shape != expected and _without_leading_ones(shape) != _without_leading_ones(expected):
+            raise _wrong_shape(name if key is None else f"{name} `{key}`", shape, expected, timestep)
+
+
+def check_finite(name: str, values: Any, timestep: int) -> None:
+    """
+    Refuse values that are NaN or infinite in float32.
+
+    :param name: the name of the values, for the error
+    :param values: an array, or arrays by key
+    :param timestep: the environment step
+    :raises ValueError: if a value is NaN or infinite
+    """
+    for key, array in values.items() if isinstance(values, dict) else [(None, values)]:
+        # False for NaN, too
+        if not (np.abs(array) <= LARGEST_FLOAT32).all():
+            which = name if key is None else f"{name} `{key}`"
+            raise ValueError(
+                f"The environment returned a NaN or infinite (in float32) {which} at environment step {timestep}: {array}. "
+                "It was not stored, and the networks are as before it."
+            )
+
+
+def _wrong_shape(name: str, shape: tuple[int, ...], expected: tuple[int, ...], timestep: int) -> ValueError:
+    message = f"The environment returned an array of a wrong shape at environment step {timestep}"
+    return ValueError(f"{message}: the {name} has shape {shape}, where {expected} is expected. It was not stored.")
+
+
+def _without_leading_ones(shape: tuple[int, ...]) -> tuple[int, ...]:
+    n_ones = next((index for index, length in enumerate(shape) if length != 1), len(shape))
+    return shape[n_ones:]
+
+
+class TransitionGuard(OffPolicyAlgorithm):
+    """An algorithm that makes the checks of :func:`make_checks` before it stores a transition."""
+
+    # Made anew for each training, as some warn once
+    _checks: list[Check]
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
+        result = super()._setup_learn(*args, **kwargs)
+        self._checks = make_checks(self.observation_space)
+        self._check_first_observations()
+        return result
+
+    def _check_first_observations(self) -> None:
+        """Check the observations that an episode starts with."""
+        assert self.env is not None
+        observations = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
+        assert observations is not None
+        if not all(isinstance(info, dict) for info in self.env.unwrapped.reset_infos):
+            raise ValueError(OLD_RESET)
+        self._check(Transition(self.num_timesteps, self.observation_space, observations, None, [], self.n_envs))
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        # Clipping by VecNormalize would hide an infinite value
+        normalizer = self._vec_normalize_env
+        rewards = reward if normalizer is None else normalizer.get_original_reward()
+        observations = new_obs if normalizer is None else normalizer.get_original_obs()
+        ended = [info for info, done in zip(infos, dones, strict=True) if done]
+        final = [info["terminal_observation"] for info in ended if info.get("terminal_observation") is not None]
+        self._check(Transition(self.num_timesteps, self.observation_space, observations, rewards, final, self.n_envs))
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _check(self, transition: Transition) -> None:
+        for check in self._checks:
+            check(transition)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_checks"]

@@ -1,0 +1,145 @@
+"""Errors that name the cause and the remedy: the old API, an `info` that is none, hindsight without a whole episode."""
+
+import re
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from guarded import SMALL, GuardedTD3, Located, located
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+
+class OldReset(Located):
+    def reset(self, *, seed=None, options=None):
+        return super().reset()[0]
+
+
+class OlderReset(Located):
+    def reset(self):
+        return super().reset()[0]
+
+
+class LongOldReset(OldReset):
+    """Three numbers, so that they cannot be taken for an observation and its information."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (3,))
+
+    def observe(self):
+        return np.append(super().observe(), 0)
+
+
+class EmptyReset(Located):
+    def reset(self, *, seed=None, options=None):
+        super().reset()
+
+
+class OldStep(Located):
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, terminated or truncated, info
+
+
+class NoInfo(Located):
+    def step(self, action):
+        return *super().step(action)[:4], None
+
+
+def bare(env):
+    return DummyVecEnv([lambda: env])
+
+
+def monitored(env):
+    return DummyVecEnv([lambda: Monitor(env)])
+
+
+def wrapped(env):
+    return DummyVecEnv([lambda: gym.wrappers.TimeLimit(env, 5)])
+
+
+@pytest.mark.parametrize("wrap", [bare, monitored, wrapped])
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (OldReset, r"`reset` must take `seed` and `options` and return two values"),
+        (OlderReset, r"`reset` must take `seed` and `options` and return two values"),
+        (LongOldReset, r"`reset` must take `seed` and `options` and return two values"),
+        (EmptyReset, r"`reset` must take `seed` and `options` and return two values"),
+        (OldStep, r"`step` must return five values"),
+        (NoInfo, r"`step` must return a dictionary as its last value"),
+    ],
+)
+def test_an_environment_of_an_old_api_is_told_what_to_return(wrap, env, message):
+    model = GuardedTD3("MlpPolicy", wrap(env()), **SMALL)
+    with pytest.raises(ValueError, match=f"The environment's {message}"):
+        model.learn(20)
+
+
+def test_an_old_reset_is_noticed_within_a_training_too():
+    class Late(Located):
+        def reset(self, *, seed=None, options=None):
+            observation, info = super().reset()
+            return (observation, info) if self.episode_count() == 1 else observation
+
+        def episode_count(self):
+            self.count = getattr(self, "count", 0) + 1
+            return self.count
+
+    model = GuardedTD3("MlpPolicy", bare(Late()), **SMALL)
+    with pytest.raises(ValueError, match="`reset` must take"):
+        model.learn(20)
+    assert model.replay_buffer.size() == 6
+
+
+def test_an_old_reset_of_a_worker_that_passes_for_a_new_one_is_noticed():
+    env = SubprocVecEnv([OldReset], start_method="fork")
+    model = GuardedTD3("MlpPolicy", env, **SMALL)
+    with pytest.raises(ValueError, match="`reset` must take"):
+        model.learn(20)
+    env.close()
+
+
+@pytest.mark.parametrize("message", ["not enough values to unpack (expected 5, got 4)", "reset() takes no arguments"])
+def test_an_error_of_the_environments_own_code_passes(message):
+    class Unpacks(Located):
+        def step(self, action):
+            raise ValueError(message)
+
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        GuardedTD3("MlpPolicy", Unpacks(), **SMALL).learn(20)
+
+
+def hindsight(n_envs=1, length=7, **kwargs):
+    arguments = SMALL | dict(replay_buffer_class=HerReplayBuffer) | kwargs
+    return GuardedTD3("MultiInputPolicy", located(n_envs, goals=True, length=length), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (dict(learning_starts=6), r"it has 7 steps of each, and the first episode is longer.* raise it to 1 x the longest"),
+        # Longer than an episode, as SB3 recommends, but shared by the environments
+        (
+            dict(n_envs=4, learning_starts=20),
+            r"the 4 environment.*it has 6 steps of each.* is 20 and counts .* to 4 x the longest",
+        ),
+        (dict(buffer_size=10, length=20, learning_starts=30), r"room of 10 steps .* `buffer_size`.* to 2 x the longest"),
+    ],
+)
+def test_hindsight_without_a_whole_episode_says_why_and_what_to_do(arguments, message):
+    arguments = dict(length=9) | arguments
+    with pytest.raises(ValueError, match=message) as caught:
+        hindsight(**arguments).learn(60)
+    assert isinstance(caught.value.__cause__, RuntimeError)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [dict(learning_starts=9), dict(n_envs=4, learning_starts=4 * 9), dict(buffer_size=40, length=20, learning_starts=20)],
+)
+def test_the_remedies_for_hindsight_work(arguments):
+    arguments = dict(length=9) | arguments
+    assert hindsight(**arguments).learn(70)._n_updates > 0

@@ -1,0 +1,188 @@
+"""Errors that the first gradient step would raise are raised when a model is made, and nothing else changes."""
+
+import random
+import re
+
+import numpy as np
+import pytest
+import torch as th
+from guarded import SMALL, GuardedTD3, Located, located
+from gymnasium import spaces
+from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+from torch import nn
+
+from sb3_cgp.guards import GuardedAlgorithm
+from sb3_cgp.guards.networks import NetworkGuard
+
+
+class Extractor(BaseFeaturesExtractor):
+    """Flattens observations, and normalises batches."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space, 2)
+        self.norm = nn.BatchNorm1d(2)
+        self.cache = None
+        self.calls = 0
+
+    def forward(self, observations):
+        self.calls += 1
+        return self.norm(observations)
+
+
+class Caching(Extractor):
+    def forward(self, observations):
+        if self.cache is None:
+            self.cache = self.norm.weight.new_ones(2) + th.randn(2)
+        return super().forward(observations) * self.cache
+
+
+class WrongShape(Extractor):
+    def forward(self, observations):
+        return super().forward(observations)[:, :1]
+
+
+class InPlace(Extractor):
+    """Works without gradients, and not with them."""
+
+    def forward(self, observations):
+        features = th.sigmoid(super().forward(observations))
+        product = features * features
+        features += 1
+        return product
+
+
+class OneRow(Extractor):
+    """Works while acting in one environment, and not on a batch."""
+
+    def forward(self, observations):
+        return self.norm(observations.reshape(1, 2)) if not self.training else super().forward(observations.reshape(1, 2))
+
+
+def make_model(extractor=Extractor, algorithm=GuardedTD3, **kwargs):
+    policy_kwargs = dict(net_arch=[4], features_extractor_class=extractor)
+    env = located()
+    env.observation_space.seed(3)
+    return algorithm("MlpPolicy", env, **(SMALL | dict(policy_kwargs=policy_kwargs) | kwargs))
+
+
+@pytest.mark.parametrize(
+    ("extractor", "arguments", "message"),
+    [
+        (WrongShape, dict(), "mat1 and mat2 shapes cannot be multiplied"),
+        (InPlace, dict(), "modified by an inplace operation"),
+        (OneRow, dict(), "shape '[1, 2]' is invalid"),
+        # Batch norm learns from two at least
+        (Extractor, dict(batch_size=1), "Expected more than 1 value per channel when training"),
+    ],
+)
+def test_a_features_extractor_that_fails_is_refused_at_construction(extractor, arguments, message):
+    plain = make_model(extractor, TD3, **arguments)
+    # SB3 says it when it acts, or later
+    with pytest.raises((RuntimeError, ValueError), match=re.escape(message)):
+        plain.learn(20)
+    expected = rf"The actor cannot learn from a batch of `observation_space`, Box\(.*{re.escape(message)}.*`policy_kwargs`"
+    with pytest.raises(ValueError, match=rf"(?s){expected}") as caught:
+        make_model(extractor, **arguments)
+    assert caught.value.__cause__ is not None
+
+
+@pytest.mark.parametrize("extractor", [Extractor, Caching])
+def test_a_trial_leaves_no_trace(extractor):
+    class Unguarded(GuardedTD3):
+        """Without the trial."""
+
+    Unguarded._setup_model = lambda self: super(NetworkGuard, self)._setup_model()
+    states, models = [], []
+    for algorithm in (Unguarded, GuardedTD3):
+        models.append(make_model(extractor, algorithm))
+        states.append((th.rand(1), np.random.rand(), random.random(), models[-1].observation_space.sample()))  # noqa: NPY002
+    assert repr(states[0]) == repr(states[1])
+    for name, value in models[0].policy.state_dict().items():
+        assert th.equal(models[1].policy.state_dict()[name], value), name
+    for network in (models[1].actor, models[1].critic, models[1].actor_target, models[1].critic_target):
+        assert network.features_extractor.calls == 0
+        assert network.features_extractor.cache is None
+        assert all(parameter.grad is None for parameter in network.parameters())
+        assert network.training is False or network in (models[1].actor, models[1].critic)
+
+
+def test_an_extractor_that_caches_a_tensor_learns():
+    model = make_model(Caching).learn(30)
+    assert model._n_updates > 0
+    assert model.actor.features_extractor.cache is not None
+
+
+@pytest.mark.parametrize(
+    ("space", "name"),
+    [
+        (spaces.Box(-1, 1, (), np.float32), r"observation_space"),
+        (spaces.Dict(a=spaces.Box(-1, 1, (2,)), b=spaces.Box(-1, 1, ())), r"observation_space\['b'\]"),
+    ],
+    ids=str,
+)
+def test_a_scalar_observation_is_refused_with_the_remedy(space, name):
+    env = Located()
+    env.observation_space = space
+    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
+    with pytest.raises(ValueError, match=rf"`{name}` is Box\(.*\), but must be of a shape .* such as \(1,\)"):
+        GuardedTD3(policy, DummyVecEnv([lambda: env]), **SMALL)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(-np.inf, np.inf, (2, 3), np.float64),
+        spaces.Box(0, 255, (3, 36, 36), np.uint8),
+        spaces.Discrete(4),
+        spaces.MultiDiscrete([2, 3]),
+        spaces.MultiBinary(3),
+        spaces.MultiBinary((2, 3)),
+        spaces.Dict(a=spaces.Box(-1, 1, (1,)), b=spaces.Discrete(3), c=spaces.Box(0, 255, (3, 36, 36), np.uint8)),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("algorithm", [TD3, SAC, DDPG])
+def test_observations_of_every_space_of_sb3_pass_the_trial(space, algorithm):
+    guarded = type("Guarded", (GuardedAlgorithm, algorithm), {})
+    env = Located()
+    env.observation_space = space
+    env.observe = space.sample
+    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
+    model = guarded(policy, DummyVecEnv([lambda: env]), **(SMALL | dict(buffer_size=20, policy_kwargs=dict(net_arch=[4]))))
+    assert model.learn(9)._n_updates > 0
+
+
+def test_hindsight_needs_goals_and_their_rewards():
+    arguments = SMALL | dict(replay_buffer_class=HerReplayBuffer)
+    with pytest.raises(ValueError, match=r"`observation_space` is .*, but must be a Dict with the keys 'observation'"):
+        GuardedTD3("MlpPolicy", located(), **arguments)
+
+    class NoReward(Located):
+        @property
+        def compute_reward(self):
+            raise AttributeError("compute_reward")
+
+    with pytest.raises(ValueError, match=r"`env` is .*, but must be one with a method `compute_reward"):
+        GuardedTD3("MultiInputPolicy", DummyVecEnv([lambda: NoReward(goals=True)]), **arguments)
+
+
+def test_a_selector_of_a_wrong_shape_is_refused():
+    class Selecting(TD3):
+        def _setup_model(self):
+            super()._setup_model()
+            selection = type("Selection", (), {"actions": th.zeros(3, 5)})
+            self.policy.select_actions = lambda observations, critic: selection
+
+    with pytest.raises(ValueError, match=r"The selector cannot .* output has shape \(3, 5\), where \(3, 1\) is expected"):
+        make_model(algorithm=type("Guarded", (GuardedAlgorithm, Selecting), {}))
+
+
+def test_a_policy_that_cannot_be_copied_is_not_tried():
+    class Uncopyable(Extractor):
+        def __deepcopy__(self, memo):
+            raise TypeError("this one is unique")
+
+    make_model(Uncopyable).learn(20)

@@ -1,0 +1,178 @@
+"""Parts that do not fit together, and action spaces that cannot be scaled: adapted, or refused by name."""
+
+import numpy as np
+import pytest
+from guarded import SMALL, GuardedTD3, Located, located
+from gymnasium import spaces
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from sb3_cgp.common.spaces import check_action_space
+from sb3_cgp.guards.parts import check_replay_buffer
+
+pytestmark = pytest.mark.filterwarnings("ignore:Nothing is learnt")
+
+
+def make_model(n_envs=1, **kwargs):
+    return GuardedTD3("MlpPolicy", located(n_envs), **(SMALL | kwargs))
+
+
+def normal(std=0.1):
+    return NormalActionNoise(np.zeros(1), np.full(1, std))
+
+
+@pytest.mark.parametrize("noise", [normal(), OrnsteinUhlenbeckActionNoise(np.zeros(1), np.ones(1))], ids=["normal", "OU"])
+@pytest.mark.parametrize(("before", "after"), [(3, 1), (1, 3), (3, 2), (2, 2)])
+def test_action_noise_follows_the_number_of_environments(noise, before, after, tmp_path):
+    make_model(before, action_noise=noise).learn(12).save(tmp_path / "model")
+    loaded = GuardedTD3.load(tmp_path / "model", located(after))
+    loaded.learn(12)
+    assert loaded.replay_buffer.actions.shape == (1000 // after, after, 1)
+    assert loaded.action_noise().shape == ((after, 1) if after > 1 else (1,))
+    base = loaded.action_noise.base_noise if after > 1 else loaded.action_noise
+    assert repr(base) == repr(noise)
+
+
+def test_noise_that_was_given_for_other_environments_follows_too():
+    model = make_model(2, action_noise=VectorizedActionNoise(normal(), 4)).learn(20)
+    assert len(model.action_noise.noises) == 2
+    assert len({noise.item() for noise in model.action_noise()}) == 2
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_noise_of_another_shape_than_the_actions_is_refused(n_envs):
+    model = make_model(n_envs, action_noise=NormalActionNoise(np.zeros(3), np.ones(3)))
+    with pytest.raises(
+        ValueError, match=r"`action_noise` is .*NormalActionNoise.*, but must be noise .* shape, \(1,\), not \(3,\)"
+    ):
+        model.learn(12)
+
+
+@pytest.mark.parametrize(("theirs", "ours"), [(4, 1), (1, 4), (2, 3)])
+def test_a_replay_buffer_of_other_environments_is_refused_and_the_models_own_kept(theirs, ours, tmp_path):
+    make_model(theirs).learn(12).save_replay_buffer(tmp_path / "buffer")
+    model = make_model(ours).learn(12)
+    own = model.replay_buffer
+    with pytest.raises(ValueError, match=rf"`replay_buffer.n_envs` is {theirs}, but must be {ours}, .*`GuardedTD3.load\(path"):
+        model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer is own
+    model.learn(12)
+
+
+def test_a_model_that_is_loaded_with_other_environments_refuses_its_old_buffer(tmp_path):
+    model = make_model(2).learn(12)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = GuardedTD3.load(tmp_path / "model", located(4), force_reset=False)
+    with pytest.raises(ValueError, match=r"`replay_buffer.n_envs` is 2, but must be 4"):
+        loaded.load_replay_buffer(tmp_path / "buffer")
+    # Its last observations are of two environments
+    loaded.learn(12, reset_num_timesteps=False)
+    assert loaded.replay_buffer.observations.shape[1] == 4
+    np.testing.assert_array_equal(loaded.replay_buffer.observations[:3, :, 1], [[0] * 4, [1] * 4, [2] * 4])
+
+
+def test_a_buffer_that_was_put_in_place_is_checked_when_learning_starts():
+    model = make_model(2)
+    model.replay_buffer = make_model(1).replay_buffer
+    with pytest.raises(ValueError, match=r"`replay_buffer.n_envs` is 1, but must be 2"):
+        model.learn(12)
+
+
+def test_environments_of_another_number_are_refused_by_set_env():
+    with pytest.raises(AssertionError, match=r"\(3 != 2\).* you must use `GuardedTD3.load\(path, env\)` instead"):
+        make_model(2).set_env(located(3))
+
+
+def with_spaces(observations=None, actions=None):
+    env = Located()
+    env.observation_space = env.observation_space if observations is None else observations
+    env.action_space = env.action_space if actions is None else actions
+    return GuardedTD3("MlpPolicy", DummyVecEnv([lambda: env]), **SMALL)
+
+
+@pytest.mark.parametrize(
+    ("name", "space"),
+    [
+        ("observation_space", spaces.Box(-1, 1, (3,), np.float32)),
+        ("observation_space", spaces.Box(0, 255, (2,), np.uint8)),
+        ("observation_space", spaces.Discrete(2)),
+        ("action_space", spaces.Box(-1, 1, (2,), np.float32)),
+        ("action_space", spaces.Box(-2, 2, (1,), np.float32)),
+    ],
+    ids=str,
+)
+def test_a_replay_buffer_of_other_spaces_is_refused(name, space, tmp_path):
+    other = with_spaces(**{name.removesuffix("_space") + "s": space})
+    other.save_replay_buffer(tmp_path / "buffer")
+    model = make_model()
+    with pytest.raises(ValueError, match=rf"`replay_buffer.{name}` is .*, but must be"):
+        model.load_replay_buffer(tmp_path / "buffer")
+
+
+def test_a_replay_buffer_of_a_narrower_float_fits():
+    model = make_model()
+    check_replay_buffer(with_spaces(observations=spaces.Box(-np.inf, np.inf, (2,), np.float64)).replay_buffer, model)
+
+
+def test_keys_of_observations_are_compared():
+    goals = GuardedTD3("MultiInputPolicy", located(goals=True), **SMALL)
+    env = Located(goals=True)
+    env.observation_space = spaces.Dict({"observation": spaces.Box(-1, 1, (2,)), "achieved_goal": spaces.Box(-1, 1, (2,))})
+    fewer = GuardedTD3("MultiInputPolicy", DummyVecEnv([lambda: env]), **SMALL)
+    check_replay_buffer(goals.replay_buffer, goals)
+    with pytest.raises(ValueError, match=r"`replay_buffer.observation_space`"):
+        check_replay_buffer(fewer.replay_buffer, goals)
+
+
+def test_a_model_with_hindsight_acts_without_an_environment(tmp_path):
+    env = located(goals=True)
+    arguments = SMALL | dict(learning_starts=20, replay_buffer_class=HerReplayBuffer)
+    model = GuardedTD3("MultiInputPolicy", env, **arguments).learn(30)
+    model.save(tmp_path / "model")
+    loaded = GuardedTD3.load(tmp_path / "model")
+    observation = env.reset()
+    np.testing.assert_array_equal(loaded.predict(observation)[0], model.predict(observation)[0])
+    loaded.set_env(env)
+    with pytest.raises(ValueError, match=r"`replay_buffer` is None: .* `GuardedTD3.load\(path, env\)`"):
+        loaded.learn(10)
+    GuardedTD3.load(tmp_path / "model", env).learn(30)
+
+
+LARGEST = np.finfo(np.float32).max
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (spaces.Box(-LARGEST, LARGEST, (2,), np.float32), r"`high - low` is finite in float32: give the environment closer"),
+        (spaces.Box(np.array([-1, -LARGEST]), np.array([1, LARGEST * 0.1]), dtype=np.float32), "finite in float32"),
+        (spaces.Box(np.float64(-1e308), np.float64(1e308), (1,), np.float64), "finite in float64"),
+        (spaces.Box(np.float16(-6e4), np.float16(6e4), (1,), np.float16), "finite in float16"),
+        (spaces.Box(0, 10, (2,), np.int64), "of a floating point dtype, such as float32"),
+        (spaces.Box(0, 255, (2,), np.uint8), "of a floating point dtype, such as float32"),
+        (spaces.Box(-1, np.inf, (2,), np.float32), "bounded: finite low < high"),
+        (spaces.Box(1, 1, (2,), np.float32), "bounded: finite low < high"),
+        (spaces.Box(-1, 1, (0,), np.float32), "bounded: finite low < high"),
+        (spaces.Discrete(3), "a gymnasium.spaces.Box"),
+        (spaces.Dict(a=spaces.Box(-1, 1)), "a gymnasium.spaces.Box"),
+    ],
+    ids=str,
+)
+@pytest.mark.filterwarnings("ignore:.*precision lowered")
+def test_an_action_space_that_cannot_be_scaled_is_refused(space, message):
+    with pytest.raises(ValueError, match=rf"(?s)`action_space` is .*, but must be .*{message}"):
+        check_action_space(space)
+
+
+@pytest.mark.parametrize("bound", [1e-30, 1.0, 1e30, 1.7e38])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_an_action_space_that_can_be_scaled_is_taken(bound, dtype):
+    space = spaces.Box(-bound, bound, (2,), dtype)
+    check_action_space(space)
+    env = Located()
+    env.action_space = space
+    policy = GuardedTD3("MlpPolicy", DummyVecEnv([lambda: env]), **SMALL).policy
+    for action in (space.low, space.high, (space.high / 2).astype(dtype)):
+        np.testing.assert_allclose(policy.unscale_action(policy.scale_action(action)), action, rtol=1e-6)
