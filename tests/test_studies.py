@@ -16,12 +16,13 @@ from optuna.storages import InMemoryStorage, RDBStorage
 from optuna.trial import TrialState
 from studies import GRACE, Clock, Crew, assert_each_run_once, make_sweep, mortal, pretend, pretend_to_train, work_through
 
-from benchmark import worker
+from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.heartbeats import PROGRESS, TrialLostError
 from benchmark.sweeps.storages import open_storage, patiently
-from benchmark.sweeps.studies import ERROR, KEY, OUTCOME, Ledger
+from benchmark.sweeps.studies import Ledger
+from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME
 from benchmark.sweeps.sweep_files import SweepError
-from benchmark.worker import work
+from benchmark.sweeps.worker_loop import execute_runs
 
 
 @pytest.fixture
@@ -330,7 +331,7 @@ def test_what_the_machine_lacks_is_no_fault_of_the_run(ledger, monkeypatch, tmp_
 
     monkeypatch.setattr(worker, "train", train)
     with pytest.raises(type(error)):
-        work(ledger, tmp_path, "a process")
+        execute_runs(ledger, tmp_path, "a process")
     assert ledger.records() == []
     assert len(ledger.left()) == 3
 
@@ -373,7 +374,7 @@ def test_by_way_of_optunas_proxy(monkeypatch, tmp_path):
         storage = open_storage(f"grpc://127.0.0.1:{port}")
         ledger = Ledger(storage, "study", GRACE)
         ledger.open(sweep, {"experiment": sweep.name})
-        work(ledger, tmp_path, "a process")
+        execute_runs(ledger, tmp_path, "a process")
         assert len(servers) == 2
         assert_each_run_once(ledger.trials(), sweep)
         assert len(ledger.records()) == 6

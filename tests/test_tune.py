@@ -22,11 +22,13 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from torch import nn
 
 from benchmark import tune
-from benchmark.sweeps import tuning
+from benchmark.sweeps import tune_execution, tuner
 from benchmark.sweeps.entries import base_entry, sampled_entry, write_entry
-from benchmark.sweeps.studies import ERROR
+from benchmark.sweeps.scoring import SCORING
+from benchmark.sweeps.study_trials import ERROR
 from benchmark.sweeps.sweep_files import SweepError
-from benchmark.sweeps.tuning import ORIGIN, SCORES, SCORING, Tuner, best_of
+from benchmark.sweeps.tuner import Tuner, best_of
+from benchmark.sweeps.tuning import ORIGIN, SCORES
 from sb3_cgp.zoo.registration import register
 
 register()
@@ -53,9 +55,9 @@ def work(tmp_path, monkeypatch):
     def act(*argv, storage=None, grace=60.0, **options):
         storage = storage or InMemoryStorage()
         args = tune.parse(arguments(*argv, "--logs", str(tmp_path), "--parent", str(os.getppid()), **options))
-        tuner = tuner_of(args, storage, grace)
-        tune.work(tuner, args)
-        return tuner.trials()
+        own = tuner_of(args, storage, grace)
+        tune_execution.execute_trials(own, args)
+        return own.trials()
 
     return act
 
@@ -70,7 +72,7 @@ def pretend(monkeypatch):
             runs.append((run.method, run.seed))
             return score(run)
 
-        monkeypatch.setattr(tuning, "train", train)
+        monkeypatch.setattr(tuner, "train", train)
         return runs
 
     return act
@@ -227,7 +229,7 @@ def test_a_failing_configuration_is_recorded_and_the_study_goes_on(work, pretend
     assert trials[1].user_attrs[ERROR] == "FloatingPointError: NaN in the critic"
     assert trials[1].user_attrs[SCORES] == [1.0]
     assert trials[1].params
-    assert "1 failed" in tune.describe(trials, 4)
+    assert "1 failed" in tune_execution.describe(trials, 4)
 
 
 def test_an_impossible_configuration_fails_by_itself(work):
@@ -243,7 +245,7 @@ def test_pruning_by_the_median_of_scores_so_far(work, pretend):
     states = [trial.state for trial in trials]
     assert states == [TrialState.COMPLETE] * 5 + [TrialState.PRUNED] * 3
     assert sum(run[0] == "trial-6" for run in runs) == 1
-    assert tune.describe(trials, 8) == "8 of 8 configurations over (3 pruned, 0 failed), 0 running, best 1 (trial 0)"
+    assert tune_execution.describe(trials, 8) == "8 of 8 configurations over (3 pruned, 0 failed), 0 running, best 1 (trial 0)"
 
 
 @pytest.mark.parametrize("score", ["mean", "min"])
@@ -315,7 +317,7 @@ def test_a_lost_configuration_is_taken_up_by_another_process(work, pretend, tmp_
     args = tune.parse(arguments("--logs", str(tmp_path)))
     dying = tuner_of(args, storage)
     dying._give_back = lambda *_: None
-    scored = tuning.train
+    scored = tuner.train
 
     def die(run, *more):
         if run.seed == 1:
@@ -323,7 +325,7 @@ def test_a_lost_configuration_is_taken_up_by_another_process(work, pretend, tmp_
         return scored(run, *more)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tuning, "train", die)
+        patch.setattr(tuner, "train", die)
         with pytest.raises(Killed):
             dying.attempt(tmp_path, 5.0, None, "cpu")
     other = tuner_of(args, storage, grace=0.01)
@@ -367,7 +369,7 @@ def test_a_study_is_not_opened_with_other_settings(work, pretend):
         (["--conf-file", "others.yml"], "Hyperparameters not found"),
         (["--conf-file", "objects.py"], "The hyperparameters of td3 for Pendulum-v1 are no plain data"),
         (["--storage", "studies.db"], "must be a database's URL"),
-        (["--storage", "postgresql://127.0.0.1:1/x"], r"Error: the storage does not answer: .*127\.0\.0\.1.*goes on\."),
+        (["--storage", "postgresql://127.0.0.1:1/x"], r"Error: the storage does not answer: .*127\.0\.0\.1.*continues\."),
     ],
 )
 def test_mistakes_end_the_command(tmp_path, monkeypatch, argv, message):

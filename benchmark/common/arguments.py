@@ -1,7 +1,6 @@
 """The arguments that the measuring commands share, refused by name where they are wrong."""
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -98,25 +97,3 @@ def output_folder(text: str) -> Path:
     except OSError as error:
         raise argparse.ArgumentTypeError(f"{text!r} cannot be made: {error.strerror}") from error
     return folder
-
-
-def measuring_parser(name: str, description: str, with_seed: bool = True) -> argparse.ArgumentParser:
-    """
-    Start the parser of a command that measures.
-
-    :param name: the command's module within ``benchmark``
-    :param description: what the command does
-    :param with_seed: whether it takes one seed; not if it takes several
-    :return: the parser, with the arguments that all such commands take
-    """
-    parser = argparse.ArgumentParser(prog=f"python -m benchmark.{name}", description=description)
-
-    def add(option: str, kind: Callable[[str], object], default: object, text: str) -> None:
-        parser.add_argument(option, type=kind, default=default, help=f"{text} (default: %(default)s)")
-
-    add("--threads", count, 1, "PyTorch's threads")
-    add("--device", device, "auto", "where the networks compute")
-    if with_seed:
-        add("--seed", int, 0, "seed of the random numbers")
-    add("--folder", output_folder, f"benchmark/results/{name}", "where the results go")
-    return parser

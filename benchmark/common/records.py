@@ -11,8 +11,9 @@ from sb3_cgp.common.files import write_atomically
 # The files of a study's folder: its records, and all else that is known of it
 RUNS = "runs.jsonl"
 STUDY = "study.json"
-# Of the final model, the same for all runs on a task
-FINAL_EPISODES = 20
+# Of the evaluation of a final model, the same for all runs on a task. The seed is far from those that people train with:
+# rl_zoo3 gives a run's own seed to the environments of its training.
+FINAL_EPISODES, EVALUATION_SEED = 20, 10_000
 
 
 def configuration_in_words(method: str, settings: dict[str, Any]) -> str:

@@ -194,11 +194,11 @@ def difference(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     return interquartile_mean(ours) - interquartile_mean(theirs)
 
 
-def spread(scores: np.ndarray) -> np.ndarray:
+def interquartile_range(scores: np.ndarray) -> np.ndarray:
     """
-    Measure how far runs scatter.
+    Return the interquartile range.
 
     :param scores: runs (R, N)
-    :return: the interquartile range (R)
+    :return: the upper quartile less the lower one (R)
     """
     return stats.iqr(scores, axis=1)

@@ -8,10 +8,10 @@ from typing import Any
 
 import pandas as pd
 
-from benchmark.common.files import markdown_table
 from benchmark.common.provenance import conditions_in_words
 from benchmark.common.records import FINAL_EPISODES
-from benchmark.reporting.claims import OURS, RULES, Finding
+from benchmark.common.tables import markdown_table
+from benchmark.reporting.claims import RULES
 from benchmark.reporting.estimates import (
     REPETITIONS,
     Estimate,
@@ -22,6 +22,7 @@ from benchmark.reporting.estimates import (
     probability_of_improvement,
 )
 from benchmark.reporting.scores import FAILURE_RULE, LENGTH_RULE, Study, failed, score_table
+from benchmark.reporting.verdicts import OURS, Finding
 
 INTRODUCTION = f"""\
 # Results of sweeps
@@ -206,8 +207,8 @@ def claims_section(findings: Sequence[Finding]) -> str:
     :return: the section, in Markdown
     """
     rows = [[finding.claim, f"**{finding.verdict}**", finding.text] for finding in findings]
-    lines = ["| " + " | ".join(row) + " |" for row in [["claim", "verdict", "what the data say"], ["---"] * 3, *rows]]
-    return "\n\n".join(["## The paper's claims", "\n".join(lines), RULES])
+    table = markdown_table(["claim", "verdict", "what the data say"], rows, align="left")
+    return "\n\n".join(["## The paper's claims", table, RULES])
 
 
 def pooled_section(picture: Picture, command: str) -> str:

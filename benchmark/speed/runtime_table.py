@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from benchmark.common.files import markdown_table
 from benchmark.common.provenance import conditions_in_words
+from benchmark.common.tables import markdown_table
 from benchmark.speed.contenders import BATCH_SIZE, NET_ARCH, REFERENCE
 
 NOTES = f"""\

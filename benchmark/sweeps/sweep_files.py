@@ -1,32 +1,36 @@
-"""The form of the files in ``hyperparams/sweeps``, and what is wrong with one that is not of it."""
+"""The form of the files in ``hyperparams/sweeps``, and the errors of a file that is not of this form."""
 
-import difflib
 from collections.abc import Sequence
 from pathlib import Path
 from string import Template
 from typing import Annotated, Any
 
-import gymnasium as gym
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 from rl_zoo3 import ALGOS
 
+from benchmark.common.environments import (
+    check_distinct_names,
+    import_packages,
+    registered_environment,
+    split_env_id,
+)
 from benchmark.sweeps.random_actions import register_random_actions
 from sb3_cgp.zoo.registration import register
 
 Hyperparams = dict[str, Any]
-# What Optuna can tell from each other
+# The types of values that Optuna distinguishes
 Value = bool | int | float | str | None
 
 
 class SweepError(ValueError):
     """
-    A sweep's file, or what was to be changed of it, is wrong.
+    A sweep's file, or an option that changes it, is wrong.
 
     :param place: the file, or the option
-    :param key: what is wrong there
-    :param problem: how, and what is allowed
+    :param key: the key in the file, or the name of the option's value
+    :param problem: what is wrong, and what is allowed
     """
 
     def __init__(self, place: object, key: str, problem: str):
@@ -41,18 +45,17 @@ def _known_algorithm(name: str) -> str:
     return name
 
 
-def known_task(name: str) -> str:
-    """
-    See that an environment is registered.
+def _imported(packages: list[str]) -> list[str]:
+    try:
+        import_packages(packages)
+    except ImportError as error:
+        raise ValueError(f"must be modules that can be imported: {error}") from error
+    return list(dict.fromkeys(packages))
 
-    :param name: the environment
-    :return: the name
-    :raises ValueError: if it is not registered
-    """
-    if name not in gym.registry:
-        close = difflib.get_close_matches(name, list(gym.registry), n=3)
-        raise ValueError("must be a registered environment" + (f", such as {', '.join(close)}" if close else ""))
-    return name
+
+def _with_distinct_names(tasks: list[str]) -> list[str]:
+    check_distinct_names(tasks)
+    return tasks
 
 
 def _with_numbers(hyperparams: Hyperparams) -> Hyperparams:
@@ -74,6 +77,16 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class Packages(_Strict):
+    """
+    Packages that a command line names.
+
+    :param gym_packages: modules to import, which register environments
+    """
+
+    gym_packages: Annotated[list[str], AfterValidator(_imported)]
+
+
 class Method(_Strict):
     """
     A method to compare.
@@ -90,7 +103,7 @@ class Method(_Strict):
 
 class Axis(_Strict):
     """
-    What is varied.
+    An axis of a sweep: the hyperparameters that are varied, and their values.
 
     :param values: a list of values, or names of values with the hyperparameters that each stands for
     :param sets: the hyperparameters that are set, where ``$value`` stands for the value; for a list of values, by
@@ -115,7 +128,7 @@ class Axis(_Strict):
 
     def hyperparams(self, name: str, value: Any, method: str) -> Hyperparams:
         """
-        Tell what a value stands for.
+        Return the hyperparameters that a value of the axis stands for.
 
         :param name: the axis
         :param value: one of its values
@@ -129,7 +142,7 @@ class Axis(_Strict):
 
 
 def _fill(template: Any, value: Any) -> Any:
-    """Put a value in its places, also in those within lists and mappings."""
+    """Return a template with the value in place of ``$value``, also within lists and mappings."""
     if template == "$value":
         return value
     if isinstance(template, dict):
@@ -146,11 +159,12 @@ def _fill(template: Any, value: Any) -> Any:
 
 class SweepFile(_Strict):
     """
-    A sweep as its file says it.
+    The content of a sweep's file.
 
-    :param title: what it is, in a few words
+    :param title: the sweep's subject, in a few words
+    :param gym_packages: modules to import, which register environments, as ``--gym-packages`` of rl_zoo3 does
     :param methods: names from ``methods.yml`` beside the file, or methods of its own by name
-    :param tasks: environments
+    :param tasks: environments; an id of the form ``module:Env-v0`` adds the module to ``gym_packages``
     :param steps: environment steps of each run
     :param seeds: how many seeds, from 0, or a list of seeds
     :param evaluation_interval: environment steps between two evaluations
@@ -158,13 +172,20 @@ class SweepFile(_Strict):
     :param checkpoint_interval: environment steps between two states to go on from; by default a tenth of the run,
         from 1,000 to 10,000
     :param hyperparams: hyperparameters for all methods
-    :param axes: what is varied, by name
+    :param axes: the axes, by name
     :param exclude: combinations of the axes' values to leave out
     """
 
     title: str
     methods: Annotated[list[str], Field(min_length=1)] | Annotated[dict[str, Method], Field(min_length=1)]
-    tasks: Annotated[list[Annotated[str, AfterValidator(known_task)]], Field(min_length=1), AfterValidator(_all_different)]
+    # Before the tasks, which are validated in this order
+    gym_packages: Annotated[list[str], AfterValidator(_imported)] = []
+    tasks: Annotated[
+        list[Annotated[str, AfterValidator(registered_environment)]],
+        Field(min_length=1),
+        AfterValidator(_all_different),
+        AfterValidator(_with_distinct_names),
+    ]
     steps: PositiveInt
     seeds: (
         PositiveInt
@@ -176,6 +197,24 @@ class SweepFile(_Strict):
     hyperparams: Hyperparams = {}
     axes: dict[str, Axis] = {}
     exclude: list[dict[str, Any]] = []
+
+    @model_validator(mode="before")
+    @classmethod
+    def _split_tasks(cls, content: Any) -> Any:
+        """Move the modules of ids of the form ``module:Env-v0`` to the packages that every worker imports."""
+        tasks, packages = content.get("tasks"), content.get("gym_packages", [])
+        if not isinstance(tasks, list) or not isinstance(packages, list):
+            return content
+        names, modules = [], []
+        for task in tasks:
+            try:
+                module, name = split_env_id(task)
+            except (AttributeError, ValueError):
+                # The task's own validator names the mistake
+                module, name = [], task
+            names.append(name)
+            modules += module
+        return {**content, "tasks": names, "gym_packages": [*packages, *modules]}
 
     @model_validator(mode="after")
     def _check(self) -> "SweepFile":
@@ -198,7 +237,7 @@ class Inclusion(_Strict):
     """
     A file that stands for several sweeps.
 
-    :param title: what it is, in a few words
+    :param title: the subject, in a few words
     :param includes: the sweeps' names
     """
 
@@ -212,7 +251,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
     :param path: the file
     :return: its content
-    :raises SweepError: if it cannot be read, or is something else
+    :raises SweepError: if it cannot be read, or holds no mapping
     """
     try:
         content = yaml.safe_load(path.read_text())
@@ -225,12 +264,12 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 def validated(kind: type[Any], content: Any, place: object, *keys: str) -> Any:
     """
-    Make a model of data.
+    Return the validated model of data.
 
     :param kind: the model's class
     :param content: the data
-    :param place: where it comes from
-    :param keys: where it is there
+    :param place: the file or the option that the data comes from
+    :param keys: the keys that lead to the data there
     :return: the model
     :raises SweepError: if the data does not fit
     """
@@ -242,7 +281,7 @@ def validated(kind: type[Any], content: Any, place: object, *keys: str) -> Any:
 
 
 def _telling(errors: Sequence[ErrorDetails]) -> Sequence[ErrorDetails]:
-    """Leave out that a list is no mapping, or the reverse, where the other alternative says what is wrong."""
+    """Return the errors without those of another alternative, such as that a list is no mapping, where this is possible."""
     telling = [each for each in errors if each["type"] not in ("list_type", "dict_type", "model_type", "int_type")]
     return telling or errors
 
