@@ -19,9 +19,9 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     Read the command line.
 
     :param argv: the arguments
-    :return: what they say
+    :return: the parsed arguments
     """
-    parser = measuring_parser("checkpoint", "Measure what it costs to save and to load a training state.")
+    parser = measuring_parser("checkpoint", "Measure the time that it takes to save and to load a training state.")
     parser.add_argument(
         "--env", type=continuous_environment, default="HalfCheetah-v5", help="the environment (default: %(default)s)"
     )

@@ -17,22 +17,24 @@ from benchmark.reporting.figures import FIGURES, FIGURES_ONLY, FOLDER, figures, 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """
-    Draw the studies that the command line names.
+    Draw the figures of the studies that the command line names, and write their page.
 
-    :param argv: the command line; None for the process's own
+    :param argv: the command line; None for that of the process
     """
-    parser = argparse.ArgumentParser(prog="python -m benchmark.figures", description="Draw and report on sweeps.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmark.figures", description="Draw the figures of sweeps, and write the page on their results."
+    )
     parser.add_argument(
         "studies", nargs="*", metavar="STUDY", help="a study's folder, or its name in the storage (default: all in --folder)"
     )
-    parser.add_argument("--folder", type=output_folder, default=FOLDER, help="where the results go (default: %(default)s)")
-    parser.add_argument("--storage", help="where named studies are: a database's URL")
+    parser.add_argument("--folder", type=output_folder, default=FOLDER, help="folder of the results (default: %(default)s)")
+    parser.add_argument("--storage", help="URL of the database that holds named studies")
     parser.add_argument(
-        "--repetitions", type=count, default=REPETITIONS, help="how often the bootstrap draws runs (default: %(default)s)"
+        "--repetitions", type=count, default=REPETITIONS, help="number of bootstrap samples (default: %(default)s)"
     )
     parser.add_argument(FIGURES_ONLY, action="store_true", help="draw the figures, and leave the page as it is")
     args = parser.parse_args(argv)
-    # Where the shell names all folders, it names that of the figures, too
+    # A shell's * names the folder of the figures, too
     named = [study for study in args.studies if Path(study) != args.folder / FIGURES]
     try:
         folders = [find(study, args.storage, args.folder) for study in named] or study_folders(args.folder)
@@ -45,20 +47,20 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def find(study: str, storage: str | None, out: Path) -> Path:
     """
-    Find a study's folder; make it if the study is in a storage.
+    Return a study's folder; export the study into it if it is in a storage.
 
     :param study: its folder or its name
-    :param storage: the storage
-    :param out: where its folder is made
+    :param storage: the URL of the storage; None for a study that is a folder
+    :param out: the folder of all results
     :return: its folder
-    :raises FileNotFoundError: if there is no such folder, and no storage was named or it has no such study
+    :raises FileNotFoundError: if the folder is missing, or the storage has no such study
     """
     if storage is None:
         for folder in (Path(study), out / study):
             if folder.is_dir():
                 return folder
         raise FileNotFoundError(f"{study} is no folder; to take a study of that name from a storage, name it with --storage")
-    # Optuna takes a second to import
+    # Optuna takes a second to import, and only studies of a storage need it
     from benchmark.sweeps.exports import export_study
 
     try:

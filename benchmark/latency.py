@@ -19,7 +19,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     Read the command line.
 
     :param argv: the arguments
-    :return: what they say
+    :return: the parsed arguments
     """
     parser = measuring_parser("latency", "Measure the time per action of a policy and of its exports.")
     parser.add_argument(

@@ -23,14 +23,14 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     Read the command line.
 
     :param argv: the arguments
-    :return: what they say
+    :return: the parsed arguments
     """
     parser = measuring_parser("precision", "Compare training with CEM in bfloat16 and in float32.", with_seed=False)
     parser.add_argument(
         "--envs", nargs="*", type=continuous_environment, default=["Pendulum-v1"], help="environments (default: Pendulum-v1)"
     )
     parser.add_argument(
-        "--steps", type=count, help="environment steps (default: what the YAML file says, 1e6 for the paper's tasks)"
+        "--steps", type=count, help="environment steps (default: those of the YAML file, 1e6 for the paper's tasks)"
     )
     parser.add_argument(
         "--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4], help="seeds of the training (default: 0 to 4)"

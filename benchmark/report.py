@@ -12,6 +12,7 @@ from pathlib import Path
 
 from rl_zoo3 import ALGOS
 
+from benchmark.common.environments import import_packages, split_env_id
 from benchmark.common.records import EVALUATION_SEED
 from benchmark.reporting.run_reports import report, summary
 from benchmark.reporting.zoo_runs import find_run, run_in
@@ -21,7 +22,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     Report on the run that the command line names.
 
-    :param argv: the command line; None for the process's own
+    :param argv: the command line; None for that of the process
     """
     parser = argparse.ArgumentParser(prog="python -m benchmark.report", description="Report on a training run of rl_zoo3.")
     parser.add_argument("--algo", default="cgp", choices=list(ALGOS), help="algorithm (default: %(default)s)")
@@ -35,8 +36,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     args = parser.parse_args(argv)
     try:
+        import_packages(split_env_id(args.env)[0])
         run = run_in(args.run) if args.run else find_run(args.folder, args.algo, args.env, args.exp_id)
-    except FileNotFoundError as error:
+    except (FileNotFoundError, ImportError, ValueError) as error:
         sys.exit(f"Error: {error}")
     print(summary(run, report(run, args.episodes, args.seed)))
 

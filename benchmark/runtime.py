@@ -21,7 +21,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     Read the command line.
 
     :param argv: the arguments
-    :return: what they say
+    :return: the parsed arguments
     """
     parser = measuring_parser("runtime", "Measure the paper's run-time table.")
     parser.add_argument("--episodes", type=count, default=10, help="training episodes per method (default: %(default)s)")

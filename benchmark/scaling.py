@@ -21,7 +21,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     Read the command line.
 
     :param argv: the arguments
-    :return: what they say
+    :return: the parsed arguments
     """
     parser = measuring_parser("scaling", "Measure how the cost of training grows.")
     parser.add_argument("--rounds", type=count, default=10, help="timed runs of each setting (default: %(default)s)")
@@ -33,7 +33,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         default="HalfCheetah-v5",
         help="environment to run several of in parallel (default: %(default)s)",
     )
-    parser.add_argument("--axes", nargs="+", choices=list(AXES), default=list(AXES), help="what to vary (default: all)")
+    parser.add_argument("--axes", nargs="+", choices=list(AXES), default=list(AXES), help="axes to vary (default: all)")
     return parser.parse_args(argv)
 
 

@@ -20,7 +20,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     Read the command line.
 
     :param argv: the arguments
-    :return: what they say
+    :return: the parsed arguments
     """
     parser = measuring_parser("selector", "Measure one CEM call across its sizes and data types.")
     parser.add_argument("--rounds", type=count, default=20, help="timed calls of each kind (default: %(default)s)")

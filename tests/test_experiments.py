@@ -176,6 +176,16 @@ def test_a_subset_of_seeds_and_a_checkpoint_interval(sweep_of):
         (dict(exclude=[{"gamma": 1}]), "gamma", "must name one of"),
         (dict(axes={"gamma": {"values": [0.5]}}, exclude=[{"gamma": 1}]), "gamma", "must have one of [0.5]"),
         (dict(hyperparams={"learning_rte": 1}), "learning_rte", "learning_rate"),
+        (dict(axes={"learning_rate": {"values": ["1e-3"]}}), "learning_rate", "'1e-3' of TD3 (td3) is text in YAML"),
+        (dict(axes={"learning_rate": {"values": ["1e-5"]}}), "learning_rate", "must be a number: write 1.0e-05"),
+        (dict(hyperparams={"tau": "0.01"}), "tau", "'0.01' of TD3 (td3) is text in YAML"),
+        (dict(hyperparams={"policy_kwargs": {"net_arch": [64, "64"]}}), "policy_kwargs", "'64' of TD3 (td3) is text in YAML"),
+        (dict(axes={"a": {"values": {"low": {"gamma": "9e-1"}}}}), "gamma", "'9e-1' of TD3 (td3) is text in YAML"),
+        (
+            dict(methods={"A": {"algo": "sac", "hyperparams": {"gamma": "high"}}}),
+            "gamma",
+            "'high' of A (sac) must be a number",
+        ),
         (dict(axes={"cem_samples": {"values": [8]}}), "cem_samples", "of TD3"),
     ],
 )

@@ -46,6 +46,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write empty files in place of pictures, for tests of what the page says."""
+    for name in ("learning_curves", "final_rewards", "stability", "sensitivity", "values"):
+        monkeypatch.setattr(command, name, lambda *args: b"")
+
+
 def test_figures_follow_from_the_runs(folder: Path) -> None:
     drawn = {path.relative_to(folder / "figures").as_posix() for path in folder.rglob("*.png")}
     axes = {"stability", "sensitivity_Pendulum-v1", "values_Pendulum-v1"}
@@ -81,6 +88,7 @@ def test_page_shows_every_figure_with_its_command(folder: Path, tmp_path: Path) 
     assert not (tmp_path / "results.md").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_page_repeats(folder: Path, tmp_path: Path) -> None:
     again = figures(study_folders(folder), tmp_path, repetitions=100).read_text()
     assert again.replace(str(tmp_path), str(folder)) == (folder / "results.md").read_text()
@@ -104,6 +112,7 @@ def test_probability_of_improvement_is_sure_where_it_is(folder: Path) -> None:
     assert "| My-PPO | 1.00 (1.00 to 1.00) | 1.00 (1.00 to 1.00) | 1.00 (1.00 to 1.00) |" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_single_seed_and_a_study_without_runs(tmp_path: Path) -> None:
     single = write_study(tmp_path / "single", runs(score, BASELINES, GRID[:2], seeds=[0]))
     empty = write_study(tmp_path / "empty", [], planned=8)
@@ -124,7 +133,12 @@ def test_a_method_whose_runs_all_failed_before_an_evaluation(tmp_path: Path) -> 
     assert "| Pendulum-v1 | PPO |" in unpadded(figures([study.folder], tmp_path, repetitions=20).read_text())
 
 
-def test_what_was_tried_in_small_leaves_claims_as_they_are(tmp_path: Path, folder: Path) -> None:
+def test_what_was_tried_in_small_leaves_claims_as_they_are(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The figures of a single study do not depend on others
+    monkeypatch.setattr(command, "draw", lambda *args: [])
+
     def claims_and_stability(*studies: str) -> tuple[str, bytes]:
         out = tmp_path / "-".join(studies)
         text = figures([tmp_path / study for study in studies], out, repetitions=50).read_text()
@@ -194,6 +208,7 @@ def test_mistakes_are_named(folder: Path, tmp_path: Path, capsys: pytest.Capture
     assert "'0' is not an integer >= 1" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_all_studies_of_a_folder(folder: Path, tmp_path: Path) -> None:
     for study in ("axis", "axes"):
         shutil.copytree(folder / study, tmp_path / study)

@@ -314,6 +314,12 @@ def test_no_patience_with_other_errors(clock):
         ("grpc://localhost", "must have a host and a port"),
         ("studies.db", "must be a database's URL"),
         ("nosuchdatabase://localhost/x", "must be a database's URL"),
+        ("sqlite://", "in the memory of one process, but must be one that other processes reach, such as sqlite:///"),
+        ("sqlite:///", "in the memory of one process"),
+        ("sqlite:///:memory:", "in the memory of one process"),
+        ("sqlite+pysqlite:///:memory:", "in the memory of one process"),
+        ("sqlite:///file::memory:?cache=shared&uri=true", "in the memory of one process"),
+        ("sqlite:///file:mine?mode=memory&uri=true", "in the memory of one process"),
     ],
 )
 def test_a_storage_that_is_none(url, message):

@@ -3,10 +3,12 @@
 import json
 
 import pytest
+import yaml
 from optuna.trial import TrialState, create_trial
 
 from benchmark.common.records import Record, read_records, write_records
 from benchmark.sweep import hyperparameter, load, main, parse
+from benchmark.sweeps.checks import check_values
 from benchmark.sweeps.execution import describe
 from benchmark.sweeps.experiments import load_sweep, study_name
 from benchmark.sweeps.exports import ended_runs, export_study
@@ -47,6 +49,67 @@ def test_a_hyperparameter_is_read_as_yaml_files_are(text, value):
     assert hyperparameter(text) == ("a", value)
 
 
+def write_sweep(folder, **changes):
+    """A sweep of a method of one's own."""
+    content = dict(title="A sweep", tasks=["Pendulum-v1"], steps=100, seeds=1, evaluation_interval=50) | changes
+    path = folder / "mine.yml"
+    path.write_text(yaml.safe_dump(content))
+    return str(path)
+
+
+def method(algo, **hyperparams):
+    return {"M": {"algo": algo, "hyperparams": {"policy": "MlpPolicy"} | hyperparams}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (dict(methods=method("cgp", tau=3)), ["M on Pendulum-v1", "`tau`"]),
+        # Each value is right, but not all combinations are
+        (
+            dict(
+                methods=method("cgp"),
+                axes={"cem_samples": {"values": [8, 64]}, "cem_elites": {"values": [6, 20]}},
+            ),
+            ["M,cem_elites=20,cem_samples=8 on Pendulum-v1", "`cem_elites`"],
+        ),
+        (dict(methods=method("td3", policy="MlpPolcy")), ["M on Pendulum-v1", "MlpPolcy"]),
+        (dict(methods=method("td3", policy_kwargs="dict(net_arch=[8, '8'])")), ["M on Pendulum-v1", "TypeError"]),
+        (dict(methods=method("sac", policy_kwargs="dict(net_arch=[8")), ["M on Pendulum-v1", "SyntaxError"]),
+        (dict(methods=method("td3", learning_rate="linear")), ["M on Pendulum-v1", "ValueError"]),
+        (dict(methods=method("td3", noise_type="loud", noise_std=0.1)), ["M on Pendulum-v1", "loud"]),
+        (dict(methods=method("td3", train_freq=[1, "stepp"])), ["M on Pendulum-v1", "stepp"]),
+        (dict(methods=method("td3", buffer_size=10.5)), ["M on Pendulum-v1", "TypeError"]),
+        (dict(methods=method("ppo", n_steps=1)), ["M on Pendulum-v1", "n_steps"]),
+        (dict(methods=method("td3"), tasks=["Pendulum-v1", "CartPole-v1"]), ["M on CartPole-v1", "Box"]),
+        (dict(methods=method("td3", env_wrapper="no.Wrapper")), ["M on Pendulum-v1", "ModuleNotFoundError"]),
+    ],
+)
+def test_values_are_checked_before_any_run_starts(tmp_path, monkeypatch, changes, words):
+    """... and before the study is made, so that the mended file needs no other name."""
+    monkeypatch.setattr("benchmark.sweeps.execution.start_workers", lambda *args: pytest.fail("it trains"))
+    places = ["--results", str(tmp_path / "results"), "--storage", f"sqlite:///{tmp_path}/studies.db"]
+    with pytest.raises(SystemExit) as error:
+        main([write_sweep(tmp_path, **changes), *places])
+    assert all(word in str(error.value) for word in ["mine.yml", "no model can be made", *words]), str(error.value)
+    assert open_storage(f"sqlite:///{tmp_path}/studies.db").get_all_studies() == []
+
+
+@pytest.mark.parametrize("name", ["e1", "e3", "e4", "e5", "e6", "e7", "e8"])
+def test_the_papers_sweeps_have_values_that_their_methods_take(name):
+    check_values(load_sweep(name, {"tasks": ["Pendulum-v1"]}))
+
+
+def test_checked_values_need_neither_memory_nor_files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sizes = []
+    monkeypatch.setattr("stable_baselines3.TD3._setup_model", lambda self: sizes.append(self.buffer_size))
+    for changes in (method("td3", buffer_size=10**12), method("td3"), method("td3", buffer_size=50)):
+        check_values(load_sweep(write_sweep(tmp_path, methods=changes)))
+    assert sizes == [10_000, 10_000, 50]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.yml"]
+
+
 def test_mistakes_end_the_command_with_what_is_allowed(tmp_path):
     common = ["--results", str(tmp_path), "--storage", f"sqlite:///{tmp_path}/studies.db"]
     for argv, words in [
@@ -62,6 +125,9 @@ def test_mistakes_end_the_command_with_what_is_allowed(tmp_path):
         (["e2", "--study", "mine"], "is 5 sweeps"),
         (["e3", "--storage", "nonsense"], "storage"),
         (["e3", "--storage", "grpc://localhost"], "port"),
+        (["e3", "--storage", "sqlite://"], "in the memory of one process"),
+        (["e3", "--study", "my/study"], "must be the name of a folder"),
+        (["e3", "--gym-packages", "no_such_package"], "no_such_package"),
     ]:
         with pytest.raises(SystemExit) as error:
             main([argv[0], *common, *argv[1:]])

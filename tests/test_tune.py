@@ -369,12 +369,20 @@ def test_a_study_is_not_opened_with_other_settings(work, pretend):
         (["--conf-file", "others.yml"], "Hyperparameters not found"),
         (["--conf-file", "objects.py"], "The hyperparameters of td3 for Pendulum-v1 are no plain data"),
         (["--storage", "studies.db"], "must be a database's URL"),
+        (["--storage", "sqlite://"], "in the memory of one process"),
+        (["--study", "my/study"], "must be the name of a folder"),
+        (["--env", "no_such_package:Env-v0"], "no_such_package"),
+        (["--gym-packages", "no_such_package"], "no_such_package"),
+        (["--conf-file", "text.yml"], "target_noise_clip: '5e-1' of the tuned method .td3. is text in YAML"),
+        (["--set", "train_freq=[1, stepp]"], "The tuned configurations: no model can be made: .*stepp"),
+        (["--algo", "cgp", "--set", "target_policy_noise=-1"], "no model can be made: .*`target_policy_noise`"),
         (["--storage", "postgresql://127.0.0.1:1/x"], r"Error: the storage does not answer: .*127\.0\.0\.1.*continues\."),
     ],
 )
 def test_mistakes_end_the_command(tmp_path, monkeypatch, argv, message):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("benchmark.sweeps.storages.TABLES_TIMEOUT", 0.0)
+    Path("text.yml").write_text("default: {policy: MlpPolicy, n_timesteps: 100, target_noise_clip: 5e-1}")
     Path("others.yml").write_text("Reacher-v5: {gamma: 0.9}")
     Path("objects.py").write_text("hyperparams = {'default': {'policy': object()}}")
     with pytest.raises(SystemExit, match=message):

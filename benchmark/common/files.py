@@ -1,4 +1,4 @@
-"""Writing results: whole files or none, and Markdown for people beside JSON for programs."""
+"""Writing results, as whole files, and the names of files."""
 
 import json
 import re
@@ -13,14 +13,14 @@ def write_json(path: Path, record: dict[str, Any]) -> None:
     Write a record.
 
     :param path: the file
-    :param record: what it shall hold; what JSON does not know is written as a string
+    :param record: the content; objects that JSON does not know are written as strings
     """
     write_atomically(path, (json.dumps(record, indent=2, default=str) + "\n").encode())
 
 
 def file_name(text: str) -> str:
     """
-    Make the name of a file or a folder of a text, such that different texts have different names.
+    Return the name of a file or a folder for a text; different texts have different names.
 
     :param text: the text, such as an environment's id or a configuration
     :return: the text with slashes, backslashes, colons and percent signs percent-encoded
@@ -30,12 +30,12 @@ def file_name(text: str) -> str:
 
 def publish(folder: Path, name: str, record: dict[str, Any], text: str | None) -> None:
     """
-    Write what a command measured, and print it.
+    Write the measurements of a command, and print them.
 
     :param folder: the folder of the files
     :param name: the files' name, without an extension
-    :param record: what was measured, written as JSON
-    :param text: the same in Markdown; None for no page
+    :param record: the measurements, which are written as JSON
+    :param text: the page in Markdown; None for no page
     """
     write_json(folder / f"{name}.json", record)
     if text is not None:

@@ -14,12 +14,12 @@ from benchmark.common.provenance import conditions
 
 def measuring_parser(name: str, description: str, with_seed: bool = True) -> argparse.ArgumentParser:
     """
-    Start the parser of a command that measures.
+    Return the parser of a command that measures.
 
     :param name: the command's module within ``benchmark``
-    :param description: what the command does
-    :param with_seed: whether it takes one seed; not if it takes several
-    :return: the parser, with the arguments that all such commands take
+    :param description: the command's description
+    :param with_seed: whether the command takes one seed; False for a command that takes several
+    :return: the parser, with the arguments of all such commands
     """
     parser = argparse.ArgumentParser(prog=f"python -m benchmark.{name}", description=description)
 
@@ -27,10 +27,10 @@ def measuring_parser(name: str, description: str, with_seed: bool = True) -> arg
         parser.add_argument(option, type=kind, default=default, help=f"{text} (default: %(default)s)")
 
     add("--threads", count, 1, "PyTorch's threads")
-    add("--device", device, "auto", "where the networks compute")
+    add("--device", device, "auto", "device of the networks")
     if with_seed:
         add("--seed", int, 0, "seed of the random numbers")
-    add("--folder", output_folder, f"benchmark/results/{name}", "where the results go")
+    add("--folder", output_folder, f"benchmark/results/{name}", "folder of the results")
     return parser
 
 
@@ -47,7 +47,7 @@ def measure_and_publish(
 
     :param name: the command's module within ``benchmark``
     :param parse: reads the command line
-    :param measure: measures, and returns the fields of the record that hold what was measured
+    :param measure: measures, and returns fields of the record
     :param recorded: the arguments that the record repeats
     :param markdown: writes the page of a record; None for no page
     :param argv: the command line; None for that of the process

@@ -1,4 +1,4 @@
-"""The paper's claims, each tested on the runs at hand: what they say, and how surely."""
+"""The paper's claims, each tested on the runs of the studies."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -47,8 +47,8 @@ def findings(table: pd.DataFrame, runtime: dict[str, Any] | None, repetitions: i
     Test all claims.
 
     :param table: the scores of all runs
-    :param runtime: what ``benchmark.runtime`` measured, if it did
-    :param repetitions: how often the bootstrap draws runs
+    :param runtime: the record of ``benchmark.runtime``; None without one
+    :param repetitions: number of bootstrap samples
     :return: a finding per claim
     """
     swept = table[table["settings"] != ""]
@@ -73,7 +73,7 @@ def best_or_second(table: pd.DataFrame, repetitions: int) -> list[Part]:
     Test whether at most one rival is better: by the lead over the second best rival.
 
     :param table: the scores of runs that vary no hyperparameter
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: a comparison for each task of each study that has two rivals
     """
 
@@ -100,7 +100,7 @@ def narrower(table: pd.DataFrame, repetitions: int) -> list[Part]:
     which the paper leaves out, too.
 
     :param table: the scores of runs that vary hyperparameters
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: a comparison per baseline
     """
     usual = table[~has_high_rate(table)]
@@ -125,7 +125,7 @@ def imitation(table: pd.DataFrame, repetitions: int) -> list[Part]:
     Test whether CGP's actor scores as much as CEM itself.
 
     :param table: the scores of all runs
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: the comparison, if both were run
     """
     found = compare(table, (OURS, IMITATED), difference, repetitions=repetitions)
@@ -140,8 +140,8 @@ def inference_cost(runtime: dict[str, Any] | None, repetitions: int) -> list[Par
     """
     Test whether acting takes as long after training with many CEM iterations as with few.
 
-    :param runtime: what ``benchmark.runtime`` measured, if it did
-    :param repetitions: how often the bootstrap draws rounds
+    :param runtime: the record of ``benchmark.runtime``; None without one
+    :param repetitions: number of bootstrap samples of the rounds
     :return: the comparison, if two numbers of iterations were timed
     """
     methods = {} if runtime is None else runtime["methods"]
@@ -156,7 +156,7 @@ def inference_cost(runtime: dict[str, Any] | None, repetitions: int) -> list[Par
     if len(ours) < 2:
         return []
     few, many = min(ours), max(ours)
-    # The methods take turns: what slows a round down slows down both
+    # The methods are timed in turn, so that a slow round affects both
     found = estimate(lambda ratios: np.median(ratios, axis=1), [[ours[many] / ours[few]]], repetitions)
     text = f"by `benchmark.runtime`, acting after {many} iterations takes {found.in_words()} times as long as after {few}"
     cem = seconds("CEM-")
@@ -170,7 +170,7 @@ def equal_variants(table: pd.DataFrame, repetitions: int) -> list[Part]:
     Test whether the better halves of the variants' runs are equal, all but QGP-Offline's.
 
     :param table: the scores of runs that vary hyperparameters
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: the comparison, if all four were run
     """
 
@@ -192,7 +192,7 @@ def best_at_the_bottom(table: pd.DataFrame, repetitions: int) -> list[Part]:
     Test whether the lowest quarter of CGP-Online's runs is better than the other variants'.
 
     :param table: the scores of runs that vary hyperparameters
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: the comparison, if all four were run
     """
 
@@ -214,7 +214,7 @@ def online_better(table: pd.DataFrame, repetitions: int) -> list[Part]:
     Test whether training the policy online gives more than training it offline.
 
     :param table: the scores of all runs
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: a comparison for CGP and one for QGP
     """
     parts = []

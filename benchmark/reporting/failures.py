@@ -18,7 +18,7 @@ def high_rate_fails(table: pd.DataFrame, repetitions: int) -> list[Part]:
     Test whether CGP fails with a high learning rate.
 
     :param table: the scores of runs that vary hyperparameters
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: the comparison with the best of the other rates, if both were run
     """
     varied = table[_has(table, LEARNING_RATE)]
@@ -30,7 +30,7 @@ def few_steps_fail(table: pd.DataFrame, repetitions: int) -> list[Part]:
     Test whether CGP fails with fewer initial random steps than the most that were tried.
 
     :param table: the scores of runs that vary hyperparameters
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: the comparison with the most, if several were tried
     """
     varied = table[_has(table, INITIAL_STEPS)]

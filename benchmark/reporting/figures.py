@@ -1,9 +1,11 @@
-"""Which figures a study gets follows from its runs; the page shows them, with the commands that draw them."""
+"""The figures of studies, which follow from their runs, and the page that shows them with the commands that draw them."""
 
 import itertools
 import json
 import re
 import shlex
+import zlib
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,9 +28,9 @@ STABILITY = "Stability: the share of runs, {}, that reach at least a final rewar
 
 def study_folders(out: Path = FOLDER) -> list[Path]:
     """
-    Find the studies in a folder.
+    Return the folders of all studies.
 
-    :param out: the folder
+    :param out: the folder of the results
     :return: their folders, by name
     """
     return sorted(runs.parent for runs in out.glob(f"*/{RUNS}"))
@@ -39,9 +41,9 @@ def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPE
     Draw the figures of studies, and write their page.
 
     :param folders: the studies' folders
-    :param out: where the page and the figures go
-    :param repetitions: how often the bootstrap draws runs
-    :param with_page: whether the page is written; if not, one that is there stays
+    :param out: the folder of the page and the figures
+    :param repetitions: number of bootstrap samples
+    :param with_page: whether the page is written; if not, an earlier one stays
     :return: the page
     :raises FileNotFoundError: if a folder holds no study
     :raises ValueError: if two have the same name
@@ -70,11 +72,11 @@ def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPE
 
 def command_line(folders: Sequence[Path], out: Path, repetitions: int) -> str:
     """
-    Write the command that draws the same.
+    Return the command that draws the same figures.
 
     :param folders: the studies' folders
-    :param out: where the page and the figures go
-    :param repetitions: how often the bootstrap draws runs
+    :param out: the folder of the page and the figures
+    :param repetitions: number of bootstrap samples
     :return: the command
     """
 
@@ -92,9 +94,9 @@ def command_line(folders: Sequence[Path], out: Path, repetitions: int) -> str:
 
 def read_runtime() -> dict[str, Any] | None:
     """
-    Read the times that ``benchmark.runtime`` measured.
+    Read the record of ``benchmark.runtime``.
 
-    :return: its record; None if there is none
+    :return: its record; None without one
     """
     return json.loads(RUNTIME.read_text()) if RUNTIME.is_file() else None
 
@@ -104,17 +106,18 @@ def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
     Draw a study's figures: with axes, its stability and its sensitivity; without, its learning curves and final rewards.
 
     :param study: the study
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: the figures; none before the first run has ended
     """
     if not study.records:
         return []
     table = score_table([study])
 
-    def picture(kind: str, caption: str, content: bytes) -> Picture:
-        # Some tasks have a slash in their name
-        folder, name = (re.sub(r"[^\w.-]+", "_", text) for text in (study.name, kind))
-        return Picture(f"{FIGURES}/{folder}/{name}.png", caption, content)
+    names = task_names(list(dict.fromkeys([*study.facts["tasks"], *study.tasks])))
+
+    def picture(kind: str, caption: str, content: bytes, task: str | None = None) -> Picture:
+        name = kind if task is None else f"{kind}_{names[task]}"
+        return Picture(f"{FIGURES}/{study.name}/{name}.png", caption, content)
 
     if not study.axes:
         curve = (
@@ -124,7 +127,7 @@ def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
         final = "Final rewards: interquartile mean, its 95 % interval, and every run as a stroke."
         return [
             *(
-                picture(f"learning_curves_{task}", curve.format(task), learning_curves(study, task, repetitions))
+                picture("learning_curves", curve.format(task), learning_curves(study, task, repetitions), task)
                 for task in study.tasks
             ),
             picture("final_rewards", final, final_rewards(study, table, repetitions)),
@@ -135,21 +138,33 @@ def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
     pictures = [picture("stability", caption, stability(table, study.methods, repetitions))]
     for task in study.tasks:
         lines = f"Sensitivity to {axes} on {task}: learning curves, means over seeds."
-        pictures.append(picture(f"sensitivity_{task}", lines, sensitivity(study, task)))
+        pictures.append(picture("sensitivity", lines, sensitivity(study, task), task))
         points = f"Final rewards on {task} by {axes}: interquartile means over all runs with a value, and 95 % intervals."
-        pictures.append(picture(f"values_{task}", points, values(study, table, task, repetitions)))
+        pictures.append(picture("values", points, values(study, table, task, repetitions), task))
     return pictures
+
+
+def task_names(tasks: Sequence[str]) -> dict[str, str]:
+    """
+    Return names of tasks for the files of figures.
+
+    :param tasks: the ids of a study's tasks
+    :return: by id, a name without a slash; that of an id whose name another one has, too, ends with the id's checksum
+    """
+    names = {task: re.sub(r"[^\w.-]+", "_", task) for task in tasks}
+    count = Counter(names.values())
+    return {task: name if count[name] == 1 else f"{name}-{zlib.crc32(task.encode()):08x}" for task, name in names.items()}
 
 
 def stability_together(studies: Sequence[Study], repetitions: int = REPETITIONS) -> list[Picture]:
     """
     Draw the stability of several sweeps together.
 
-    Those that compare two methods in common belong together; what shares one method only answers another question.
+    Sweeps belong together that have two methods in common; a sweep that shares one method answers another question.
 
     :param studies: the studies
-    :param repetitions: how often the bootstrap draws runs
-    :return: the figure of the largest group of sweeps; none if there is no group of two
+    :param repetitions: number of bootstrap samples
+    :return: the figure of the largest group of sweeps; none without a group of two
     """
     groups: list[list[Study]] = []
     for study in studies:

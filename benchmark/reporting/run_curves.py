@@ -20,7 +20,7 @@ class Curve:
     """
     Returns against training steps.
 
-    :param source: what the returns come from, in words
+    :param source: the origin of the returns, as text
     :param timesteps: environment steps at each point
     :param mean: mean return at each point
     :param std: standard deviation over a point's episodes
@@ -34,9 +34,9 @@ class Curve:
     @classmethod
     def from_returns(cls, source: str, timesteps: Sequence[int], returns: Sequence[np.ndarray]) -> "Curve":
         """
-        Make a curve from the returns of each point's episodes.
+        Return the curve of the returns of each point's episodes.
 
-        :param source: what the returns come from, in words
+        :param source: the origin of the returns, as text
         :param timesteps: environment steps at each point
         :param returns: the returns of the episodes at each point
         :return: the curve

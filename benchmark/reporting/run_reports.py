@@ -22,7 +22,7 @@ from sb3_cgp.common.files import write_atomically
 
 def evaluation_env_kwargs(run: Run) -> dict[str, Any]:
     """
-    Collect the arguments of the run's evaluation environment: the command line's before the YAML file's.
+    Return the arguments of the run's evaluation environment: the command line's before the YAML file's.
 
     :param run: the run
     :return: keyword arguments for the environment
@@ -33,7 +33,7 @@ def evaluation_env_kwargs(run: Run) -> dict[str, Any]:
 
 def make_env(run: Run, seed: int) -> VecEnv:
     """
-    Make the run's evaluation environment, with its wrappers and its normalisation statistics.
+    Return the run's evaluation environment, with its wrappers and its normalisation statistics.
 
     :param run: the run
     :param seed: the environment's seed
@@ -88,7 +88,7 @@ def evaluate(run: Run, model: BaseAlgorithm, env: VecEnv, episodes: int) -> list
 
 def build_record(run: Run, model: BaseAlgorithm, curve: Curve, returns: list[float], seed: int) -> dict[str, Any]:
     """
-    Put together everything that the report says, with what it was measured with.
+    Return the record of a report, with versions and hardware.
 
     :param run: the run
     :param model: the run's model
@@ -127,7 +127,7 @@ def report(run: Run, episodes: int, seed: int) -> dict[str, Any]:
     :param seed: the seed of the final evaluation
     :return: the record
     """
-    # As many threads as the run trained with, so that what the record says of the machine holds for both
+    # With the run's number of threads, so that the machine in the record is that of the training, too
     threads = run.read_yaml("args.yml").get("num_threads", -1)
     if threads > 0:
         th.set_num_threads(threads)
@@ -144,7 +144,7 @@ def report(run: Run, episodes: int, seed: int) -> dict[str, Any]:
 
 def summary(run: Run, record: dict[str, Any]) -> str:
     """
-    Say in a few lines how a run ended and where everything lies.
+    Return a few lines on the final evaluation and the files of a run.
 
     :param run: the run
     :param record: its record

@@ -17,8 +17,8 @@ class Part:
     """
     One comparison that a claim rests on.
 
-    :param text: what was compared, and what came out
-    :param verdict: what that says of the claim
+    :param text: the comparison and its result
+    :param verdict: the verdict on the claim
     """
 
     text: str
@@ -28,7 +28,7 @@ class Part:
 @dataclass(frozen=True)
 class Finding:
     """
-    What the runs say of a claim.
+    The finding on a claim.
 
     :param claim: the paper's claim
     :param parts: the comparisons that it rests on; none without data
@@ -39,7 +39,7 @@ class Finding:
 
     @property
     def verdict(self) -> str:
-        """What all parts together say."""
+        """The verdict of all parts together."""
         verdicts = [part.verdict for part in self.parts]
         if not verdicts:
             return NO_DATA
@@ -49,7 +49,7 @@ class Finding:
 
     @property
     def text(self) -> str:
-        """What all parts say, each with its verdict if there are several."""
+        """The text of all parts, each with its verdict if there are several."""
         if len(self.parts) == 1:
             return self.parts[0].text
         return "; ".join(f"{part.text}: {part.verdict}" for part in self.parts)
@@ -57,11 +57,11 @@ class Finding:
 
 def judge(found: Estimate, more_than: float = -np.inf, less_than: float = np.inf) -> str:
     """
-    Compare an interval with what a claim needs.
+    Compare an interval with the bounds of a claim.
 
     :param found: the estimate
-    :param more_than: what it must be above
-    :param less_than: what it must be below
+    :param more_than: the lower bound
+    :param less_than: the upper bound
     :return: the verdict
     """
     if found.interval is None or found.runs < FEWEST_RUNS:

@@ -7,7 +7,7 @@ from benchmark.common.tables import markdown_table
 from benchmark.speed.products import Sizes
 
 NOTES = """\
-Milliseconds of one CEM call on a Q-network with {n_features} features, two hidden layers and rectifiers: medians of {rounds}
+Milliseconds of one CEM call on a Q-network with {n_features} features, two hidden layers and ReLU: medians of {rounds}
 calls, everything in the table taken in turn; one size is varied at a time around the first lines'. "/ plain" is the ratio
 to the same call with the observation repeated for every sample in float32; "of products" the time of the bare products
 over the call's. Both are medians of the ratios within each round.
@@ -23,7 +23,7 @@ def markdown(record: dict[str, Any]) -> str:
     """
     Write the table.
 
-    :param record: what was measured, and how
+    :param record: the measurements and their conditions
     :return: the table and its notes, in Markdown
     """
     header = [

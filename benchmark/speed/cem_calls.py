@@ -28,7 +28,7 @@ VARIATIONS: dict[str, tuple[int, ...]] = {
 
 def sizes_to_measure(varied: Sequence[str]) -> list[Sizes]:
     """
-    Vary one size at a time around the default.
+    Return the sizes to measure: one is varied at a time around the default.
 
     :param varied: the sizes to vary
     :return: the default, then the others, each once
@@ -39,11 +39,11 @@ def sizes_to_measure(varied: Sequence[str]) -> list[Sizes]:
 
 def cem_call(sizes: Sizes, make_score: Callable[[nn.Module, th.Tensor], Score], device: th.device) -> Callable[[], object]:
     """
-    Make a CEM call on a random critic, as a gradient step makes it.
+    Return a function that makes a CEM call on a random critic, as a gradient step does.
 
     :param sizes: the call's sizes
-    :param make_score: makes the scoring function of a Q-network and of the states' features
-    :param device: where to compute
+    :param make_score: returns the scoring function of a Q-network and of the states' features
+    :param device: device of the networks
     :return: the function to time
     """
     q_network = nn.Sequential(*create_mlp(sizes.n_features + sizes.action_dim, 1, [sizes.width] * 2)).to(device)
@@ -59,7 +59,7 @@ def cem_call(sizes: Sizes, make_score: Callable[[nn.Module, th.Tensor], Score], 
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
     """
-    Measure all the calls asked for.
+    Measure the calls that the command line asks for.
 
     :param args: the command line
     :return: under "calls", the figures of each combination of sizes and data type
@@ -94,14 +94,14 @@ def figures(
     sizes: Sizes, dtype: str, call: list[float], plain: list[float], outer: list[float], products: dict[str, list[float]]
 ) -> dict[str, Any]:
     """
-    Put together what is known of one call.
+    Summarise the measurements of one call.
 
     :param sizes: the call's sizes
     :param dtype: the data type of the hidden layers
     :param call: its seconds, by round
-    :param plain: the plain way's
-    :param outer: those of the products of the first and the last layer
-    :param products: the bare products', by way
+    :param plain: the seconds of the call with repeated observations
+    :param outer: the seconds of the products of the first and the last layer
+    :param products: the seconds of the bare products, by kernel and block
     :return: seconds, speeds and ratios
     """
     summaries = {way: summary(times) for way, times in products.items()}

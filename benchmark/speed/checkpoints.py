@@ -19,7 +19,7 @@ NOTES = """\
 Seconds for which training stands still, on {env} with a replay buffer of {transitions} transitions, all of them filled, and
 networks of the default size: medians of {rounds} rounds, the quartiles beside them. "First" writes all of it to an empty
 folder, "second" all of it once more, {new} steps later, as two states share no file, and "later", {new} steps later again,
-what has changed since the first; "load" reads all of a state and verifies its checksums. On the disk: {size:.0f} MB, with
+the changes since the first; "load" reads all of a state and verifies its checksums. On the disk: {size:.0f} MB, with
 two states."""
 
 
@@ -28,7 +28,7 @@ def fill(buffer: ReplayBuffer, rows: int, generator: np.random.Generator) -> Non
     Store random transitions.
 
     :param buffer: the buffer
-    :param rows: how many
+    :param rows: number of transitions
     :param generator: random numbers
     """
     places = (buffer.pos + np.arange(rows)) % buffer.buffer_size
@@ -71,7 +71,7 @@ def markdown(record: dict[str, Any]) -> str:
     """
     Write the table.
 
-    :param record: what was measured, and how
+    :param record: the measurements and their conditions
     :return: the table and its notes, in Markdown
     """
     rows = [

@@ -23,10 +23,10 @@ each round. The exported policies compute on the CPU; the network that `predict`
 
 def ways_to_act(model: CGP, folder: Path, threads: int) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
     """
-    Export a model, and list the ways to ask its policy.
+    Export a model, and return the ways to compute an action of its policy.
 
     :param model: the model
-    :param folder: where to export it to
+    :param folder: the folder of the export
     :param threads: onnxruntime's threads
     :return: functions from an observation, of the environment's shape, to an action, by name
     """
@@ -44,7 +44,7 @@ def ways_to_act(model: CGP, folder: Path, threads: int) -> dict[str, Callable[[n
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
     """
-    Measure all the ways.
+    Measure all ways to compute an action.
 
     :param args: the command line
     :return: under "ways", seconds per action and the ratio to ``predict``, by name
@@ -78,7 +78,7 @@ def markdown(record: dict[str, Any]) -> str:
     """
     Write the table.
 
-    :param record: what was measured, and how
+    :param record: the measurements and their conditions
     :return: the table and its notes, in Markdown
     """
     header = ["way", "µs per action", "lower", "upper", "/ predict"]

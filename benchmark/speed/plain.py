@@ -1,4 +1,4 @@
-"""CGP as one would first write it: the yardstick for the speed of ours."""
+"""CGP with its critic called on repeated observations, the reference for the speed of the package's CGP."""
 
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
@@ -15,7 +15,7 @@ class PlainPolicy(CGPPolicy):
     """
     CGP's policy with the observation repeated for every sample, in float32, one operation at a time.
 
-    Its networks are SB3's. It takes the critic in the mode that it finds it in: right only for networks without dropout and
+    Its networks are SB3's. It does not set the critic's training mode, and so is right only for networks without dropout and
     batch norm.
     """
 

@@ -50,9 +50,9 @@ def run(env_id: str, dtype: str, seed: int, args: argparse.Namespace, argv: Sequ
 
 def read_records(folder: Path) -> list[dict[str, Any]]:
     """
-    Read the runs that are done.
+    Read the records of finished runs.
 
-    :param folder: where their records lie
+    :param folder: the folder of the records
     :return: the records, by task, data type and seed
     """
     records = [json.loads(path.read_text()) for path in folder.glob("*_seed*.json")]

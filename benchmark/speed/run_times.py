@@ -11,13 +11,13 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from benchmark.speed.contenders import CONTENDERS, REFERENCE, RandomAgent, make_agent, takes_cem_dtype
 from benchmark.speed.timing import interleaved, ratio, summary
 
-# Episodes between two entries in the log: none is ever written
+# Episodes between two entries in the log, so that none is written
 NO_LOG = 10**9
 
 
 def prepare(agents: dict[str, OffPolicyAlgorithm], steps: int) -> None:
     """
-    Train for a while, until every first time is over: filling the buffer, compiling, capturing.
+    Train until all initial work is done: filling the buffer, compiling, capturing CUDA graphs.
 
     :param agents: the models, untrained
     :param steps: environment steps
@@ -28,7 +28,7 @@ def prepare(agents: dict[str, OffPolicyAlgorithm], steps: int) -> None:
 
 def training_episode(agent: OffPolicyAlgorithm, steps: int) -> Callable[[], object]:
     """
-    Make a training episode, which goes on where the last one ended.
+    Return a function that trains for an episode, and continues from its last call.
 
     :param agent: the model
     :param steps: environment steps per episode
@@ -39,10 +39,10 @@ def training_episode(agent: OffPolicyAlgorithm, steps: int) -> Callable[[], obje
 
 def inference_episode(agent: OffPolicyAlgorithm | RandomAgent, env_id: str, seed: int, steps: int) -> Callable[[], object]:
     """
-    Make an inference episode, which goes on where the last one ended.
+    Return a function that acts for an episode, and continues from its last call.
 
     :param agent: the model
-    :param env_id: the environment, of which it gets one of its own
+    :param env_id: the environment, which is made anew
     :param seed: the environment's seed
     :param steps: environment steps per episode
     :return: the function to time
@@ -61,10 +61,10 @@ def inference_episode(agent: OffPolicyAlgorithm | RandomAgent, env_id: str, seed
 
 def make_agents(args: argparse.Namespace) -> tuple[dict[str, OffPolicyAlgorithm | RandomAgent], dict[str, str]]:
     """
-    Make the models of the methods asked for.
+    Return the models of the methods that the command line asks for.
 
     :param args: the command line
-    :return: the models, and why others could not be made
+    :return: the models, and the reasons why others could not be made
     """
     agents: dict[str, OffPolicyAlgorithm | RandomAgent] = {}
     missing = {}
@@ -80,10 +80,10 @@ def make_agents(args: argparse.Namespace) -> tuple[dict[str, OffPolicyAlgorithm 
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
     """
-    Measure the methods asked for.
+    Measure the methods that the command line asks for.
 
     :param args: the command line
-    :return: the number of untimed gradient steps, and what was measured, by method
+    :return: the number of untimed gradient steps, and under "methods", the measurements by method
     """
     if args.threads == 1:
         # JAX reads this when it is first imported
@@ -115,7 +115,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
 
 def burn_in_steps(episode_steps: int) -> int:
     """
-    Choose how many gradient steps go untimed before the first timed one.
+    Return the number of untimed gradient steps before the first timed one.
 
     :param episode_steps: environment steps per episode
     :return: a fifth of an episode
@@ -125,7 +125,7 @@ def burn_in_steps(episode_steps: int) -> int:
 
 def figures(seconds: dict[str, list[float]], name: str, paper_ratio: float | None) -> dict[str, Any] | None:
     """
-    Put together what is known of one method's time.
+    Summarise the measurements of one method.
 
     :param seconds: the seconds of every method, by round
     :param name: the method

@@ -33,7 +33,7 @@ AXES: dict[str, tuple[int, ...]] = {
 @dataclass(frozen=True)
 class Setting:
     """
-    What is measured at one point, by default the paper's settings at HalfCheetah's sizes.
+    The settings of one measurement, by default the paper's at HalfCheetah's sizes.
 
     :param algorithm: "CGP" or "TD3"
     :param cem_iterations: iterations of CEM
@@ -55,10 +55,10 @@ class Setting:
 
 def setting_at(algorithm: str, axis: str, value: int) -> Setting:
     """
-    Find what to measure at a point of an axis.
+    Return the setting at a point of an axis.
 
     :param algorithm: "CGP" or "TD3"
-    :param axis: what is varied
+    :param axis: the varied field of the setting
     :param value: its value
     :return: the setting; TD3 has no CEM to vary, and is the same all along its axes
     """
@@ -70,10 +70,10 @@ def setting_at(algorithm: str, axis: str, value: int) -> Setting:
 
 def make_env(setting: Setting, env_id: str, seed: int) -> VecEnv:
     """
-    Make a setting's environments.
+    Return the environments of a setting.
 
     :param setting: the setting
-    :param env_id: the environment to make several of, where their number is measured
+    :param env_id: the environment, where the number of environments is measured
     :param seed: their seed
     :return: the environments
     """
@@ -84,12 +84,12 @@ def make_env(setting: Setting, env_id: str, seed: int) -> VecEnv:
 
 def make_model(setting: Setting, env: VecEnv, seed: int, device: th.device) -> OffPolicyAlgorithm:
     """
-    Make a setting's model, with enough transitions in its buffer to train on.
+    Return the model of a setting, with enough transitions in its buffer for training.
 
     :param setting: the setting
     :param env: its environments
     :param seed: seed of its random numbers
-    :param device: where its networks compute
+    :param device: device of its networks
     :return: the model
     """
     common: dict[str, Any] = dict(
@@ -114,7 +114,7 @@ def make_model(setting: Setting, env: VecEnv, seed: int, device: th.device) -> O
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
     """
-    Measure all the points asked for.
+    Measure the points that the command line asks for.
 
     :param args: the command line
     :return: under "points", the measurements by axis and value

@@ -81,7 +81,9 @@ def execute(sweep: Sweep, storage: BaseStorage, study: str, args: argparse.Names
     ledger.open(sweep, description, ended)
     check_no_run_is_lost(args.results / study, ledger)
     tracker = ProgressTracker(sweep.file.steps)
-    workers = start_workers(worker_command(args, study), args.workers, args.threads, args.logs / study)
+    # A finished study needs no process that finds nothing to train
+    n_workers = args.workers if ledger.left() else 0
+    workers = start_workers(worker_command(args, study), n_workers, args.threads, args.logs / study)
     try:
         with display(study) as show:
             while True:

@@ -226,9 +226,7 @@ def load_sweep(name: str, overrides: dict[str, Any] | None = None, methods: Sequ
     sweep = Sweep(path.stem, file, {method: known[method] for method in chosen}, changes, path)
     for run in {run.configuration: run for run in sweep.runs()}.values():
         for key, problem in problems(run.method, run.algo, run.hyperparams):
-            is_the_methods = isinstance(sweep.file.methods, list) and key in sweep.methods[run.method].hyperparams
-            place = "the command line" if key in changed else _methods_file(path) if is_the_methods else path
-            raise SweepError(place, key, problem)
+            raise SweepError(_origin(sweep, path, run, key, changed), key, problem)
     return sweep
 
 
@@ -271,3 +269,16 @@ def study_name(prefix: str, given: str | None, tasks: Iterable[str] | None = Non
     if given in ("", ".", "..") or "/" in given or "\\" in given:
         raise SweepError("the command line", "--study", f"{given!r} must be the name of a folder, without a slash")
     return given
+
+
+def _origin(sweep: Sweep, path: Path, run: Run, key: str, changed: Hyperparams) -> object:
+    """Return the place that a hyperparameter of a run comes from."""
+
+    def sets(hyperparams: Hyperparams) -> bool:
+        return key in hyperparams and hyperparams[key] == run.hyperparams[key]
+
+    if sets(changed):
+        return "the command line"
+    return (
+        _methods_file(path) if isinstance(sweep.file.methods, list) and sets(sweep.methods[run.method].hyperparams) else path
+    )

@@ -37,7 +37,7 @@ def problems(method: str, algo: str, hyperparams: dict[str, Any]) -> Iterator[tu
             close = ", ".join(difflib.get_close_matches(name, allowed, n=3) or sorted(allowed))
             yield name, f"no hyperparameter of {method} ({algo}), which must be one of {close}"
         for text in _numbers_as_text(value):
-            number = yaml.safe_dump(float(text)).splitlines()[0]
+            number = text if text.isdecimal() else yaml.safe_dump(float(text)).splitlines()[0]
             yield name, f"{text!r} of {method} ({algo}) is text in YAML, and must be a number: write {number}"
         default = parameters[name].default if name in parameters else None
         is_number = isinstance(default, int | float) and not isinstance(default, bool)

@@ -39,27 +39,34 @@ def open_storage(url: str) -> BaseStorage:
                 f"The value of `storage` is {url!r}, but must have a host and a port, as in grpc://localhost:13000"
             )
         return GrpcStorageProxy(host=parts.hostname, port=parts.port)
-    try:
-        database = make_url(url)
-        # What SQLAlchemy takes for PostgreSQL's driver depends on its version
-        if database.drivername == "postgresql":
-            database = database.set(drivername="postgresql+psycopg2")
-        # The driver of the database
-        create_engine(database)
-    except (ArgumentError, ImportError) as error:
-        raise ValueError(f"The value of `storage` is {url!r}, but must be a database's URL: {error}") from error
+    database = _read_url(url)
     if database.get_backend_name() != "sqlite":
         return get_storage(_open_database(database, {"pool_pre_ping": True}))
-    if _is_in_memory(database):
-        raise ValueError(
-            f"The value of `storage` is {url!r}, a database in the memory of one process, but must be one that other "
-            f"processes reach, such as {DEFAULT_STORAGE}"
-        )
     assert database.database is not None
     Path(database.database).parent.mkdir(parents=True, exist_ok=True)
     storage = _open_database(database, {"connect_args": {"timeout": SQLITE_TIMEOUT}})
     _make_transactions_exclusive(storage)
     return get_storage(storage)
+
+
+def _read_url(url: str) -> URL:
+    try:
+        database = make_url(url)
+        # SQLAlchemy's default driver for PostgreSQL depends on its version
+        if database.drivername == "postgresql":
+            database = database.set(drivername="postgresql+psycopg2")
+        is_in_memory = database.get_backend_name() == "sqlite" and _is_in_memory(database)
+        if not is_in_memory:
+            # Imports the driver
+            create_engine(database)
+    except (ArgumentError, ImportError) as error:
+        raise ValueError(f"The value of `storage` is {url!r}, but must be a database's URL: {error}") from error
+    if is_in_memory:
+        raise ValueError(
+            f"The value of `storage` is {url!r}, a database in the memory of one process, but must be one that other "
+            f"processes reach, such as {DEFAULT_STORAGE}"
+        )
+    return database
 
 
 def _is_in_memory(database: URL) -> bool:
