@@ -17,7 +17,7 @@ from benchmark.sweeps.execution import execute
 from benchmark.sweeps.experiments import Sweep, included_sweeps, load_sweep, study_name
 from benchmark.sweeps.processes import add_workers, check_grace, share_of_cores, terminate
 from benchmark.sweeps.storages import STORAGE_ERRORS, open_storage, reason_of
-from benchmark.sweeps.sweep_files import SweepError
+from benchmark.sweeps.validation import SweepError
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:

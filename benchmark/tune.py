@@ -19,8 +19,9 @@ from benchmark.common.arguments import count, hyperparameter
 from benchmark.common.environments import import_packages, registered_environment, split_env_id
 from benchmark.sweeps.checks import check_tuning
 from benchmark.sweeps.entries import base_entry, write_entry
-from benchmark.sweeps.experiments import checkpoint_interval, study_name
+from benchmark.sweeps.experiments import study_name
 from benchmark.sweeps.processes import add_workers, check_grace, install_signal_handlers, share_of_cores, terminate
+from benchmark.sweeps.runs import checkpoint_interval
 from benchmark.sweeps.scoring import PRUNERS, SCORING
 from benchmark.sweeps.storages import STORAGE_ERRORS, open_storage, patiently, reason_of
 from benchmark.sweeps.tune_execution import execute_trials, tune

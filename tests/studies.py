@@ -11,7 +11,8 @@ from optuna.trial import TrialState
 
 from benchmark.sweeps import storages
 from benchmark.sweeps import worker_loop as worker
-from benchmark.sweeps.experiments import Run, Sweep
+from benchmark.sweeps.experiments import Sweep
+from benchmark.sweeps.runs import Run
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import ERROR, KEY, owned
 from benchmark.sweeps.sweep_files import Method, SweepFile

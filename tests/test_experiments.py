@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from benchmark.sweeps.experiments import included_sweeps, load_sweep, sweeps_folder
-from benchmark.sweeps.sweep_files import SweepError
+from benchmark.sweeps.validation import SweepError
 
 GOOD = dict(title="A sweep", methods=["TD3", "CGP-Online"], tasks=["Pendulum-v1"], steps=100, seeds=2, evaluation_interval=10)
 PAPER = ["e1", "e3", "e4", "e5", "e6", "e7", "e8"]
@@ -193,6 +193,11 @@ def test_a_mistake_is_named_with_what_is_allowed(tmp_path, sweep_of, changes, ke
     with pytest.raises(SweepError) as error:
         sweep_of(**changes)
     assert all(part in str(error.value) for part in (str(tmp_path / "mine.yml"), key, allowed)), str(error.value)
+
+
+def test_text_that_looks_like_a_number_is_left_to_other_code(sweep_of):
+    sweep = sweep_of(hyperparams={"env_kwargs": {"version": "2"}, "env_wrapper": [{"my.Wrapper": {"name": "1e3"}}]}, seeds=1)
+    assert all(run.hyperparams["env_kwargs"] == {"version": "2"} for run in sweep.runs())
 
 
 def test_no_sweep_of_that_name():

@@ -15,7 +15,7 @@ from rl_zoo3.utils import get_model_path
 
 from benchmark import plan, report, sweep, tune
 from benchmark.common.arguments import continuous_environment
-from benchmark.common.environments import check_distinct_names, registered_environment, split_env_id
+from benchmark.common.environments import registered_environment, split_env_id
 from benchmark.common.files import file_name
 from benchmark.common.zoo import read_entry
 from benchmark.reporting.figures import task_names
@@ -25,7 +25,7 @@ from benchmark.sweeps.entries import write_entry
 from benchmark.sweeps.experiments import load_sweep, study_name
 from benchmark.sweeps.run import run_folder, train
 from benchmark.sweeps.studies import Ledger
-from benchmark.sweeps.sweep_files import SweepError
+from benchmark.sweeps.validation import SweepError
 
 MODULE = """
 import gymnasium as gym
@@ -239,8 +239,6 @@ def test_ids_are_split_as_gymnasium_splits_them(package):
     assert continuous_environment(f"{package}:{SLASH}") == SLASH
     with pytest.raises(ValueError, match="cannot be imported"):
         registered_environment("no_such_package:Env-v0")
-    with pytest.raises(ValueError, match="same name in rl_zoo3's folders"):
-        check_distinct_names([SLASH, DASH])
 
 
 def test_figures_of_ids_whose_names_are_the_same_have_different_files():

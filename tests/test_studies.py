@@ -21,7 +21,7 @@ from benchmark.sweeps.heartbeats import PROGRESS, TrialLostError
 from benchmark.sweeps.storages import open_storage, patiently
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME
-from benchmark.sweeps.sweep_files import SweepError
+from benchmark.sweeps.validation import SweepError
 from benchmark.sweeps.worker_loop import execute_runs
 
 

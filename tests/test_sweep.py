@@ -17,7 +17,7 @@ from benchmark.sweeps.progress import ProgressTracker
 from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import ERROR, KEY
-from benchmark.sweeps.sweep_files import SweepError
+from benchmark.sweeps.validation import SweepError
 
 SMALL = ["e8", "--task", "Pendulum-v1", "--steps", "400", "--seeds", "1", "--methods", "TD3"]
 

@@ -26,9 +26,9 @@ from benchmark.sweeps import tune_execution, tuner
 from benchmark.sweeps.entries import base_entry, sampled_entry, write_entry
 from benchmark.sweeps.scoring import SCORING
 from benchmark.sweeps.study_trials import ERROR
-from benchmark.sweeps.sweep_files import SweepError
 from benchmark.sweeps.tuner import Tuner, best_of
 from benchmark.sweeps.tuning import ORIGIN, SCORES
+from benchmark.sweeps.validation import SweepError
 from sb3_cgp.zoo.registration import register
 
 register()

@@ -1,11 +1,10 @@
-"""Ids of environments: those that another module registers, and the names that files and folders get from them."""
+"""Ids of environments, also of those that another module registers."""
 
 import difflib
 import importlib
 from collections.abc import Iterable
 
 import gymnasium as gym
-from huggingface_sb3 import EnvironmentName
 
 
 def split_env_id(env_id: str) -> tuple[list[str], str]:
@@ -55,21 +54,3 @@ def registered_environment(env_id: str) -> str:
             "an id of the form module:Env-v0"
         )
     return name
-
-
-def check_distinct_names(env_ids: Iterable[str]) -> None:
-    """
-    Check that no two environments share the name that rl_zoo3 gives to files and folders.
-
-    :param env_ids: the ids, each once
-    :raises ValueError: if two share a name: ``a/Env-v0`` and ``a-Env-v0`` do
-    """
-    ids: dict[str, str] = {}
-    for env_id in env_ids:
-        name = str(EnvironmentName(env_id))
-        if name in ids:
-            raise ValueError(
-                f"{ids[name]!r} and {env_id!r} have the same name in rl_zoo3's folders, {name}: run them as two sweeps, with "
-                "a --study for each"
-            )
-        ids[name] = env_id

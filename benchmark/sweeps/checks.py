@@ -15,10 +15,11 @@ from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from benchmark.common.zoo import silence
-from benchmark.sweeps.experiments import Run, Sweep
+from benchmark.sweeps.experiments import Sweep
 from benchmark.sweeps.hyperparameters import problems
-from benchmark.sweeps.sweep_files import SweepError
+from benchmark.sweeps.runs import Run
 from benchmark.sweeps.tuning import Tuning
+from benchmark.sweeps.validation import SweepError
 
 # A replay buffer that is only constructed needs no more memory than this
 LARGEST_BUFFER = 10_000
@@ -54,9 +55,9 @@ def check_tuning(tuning: Tuning) -> None:
         trial = study.ask()
         tuning.sample(trial)
         run = tuning.run(study.trials[trial.number], seed=0)
-        for key, problem in problems("the tuned method", run.algo, {**run.hyperparams, "n_timesteps": run.steps}):
-            if key != "n_timesteps":
-                raise SweepError("The tuned configurations", key, problem)
+        hyperparams = {name: value for name, value in run.hyperparams.items() if name != "n_timesteps"}
+        for key, problem in problems("the tuned method", run.algo, hyperparams):
+            raise SweepError("The tuned configurations", key, problem)
         try:
             return construct(run)
         except Exception as error:

@@ -12,10 +12,11 @@ from optuna.storages import BaseStorage
 from stable_baselines3.common.utils import get_device
 
 from benchmark.common.provenance import conditions
-from benchmark.sweeps.experiments import Sweep, overview
+from benchmark.sweeps.experiments import Sweep
 from benchmark.sweeps.exports import check_no_run_is_lost, ended_runs, export_study, without_places
 from benchmark.sweeps.processes import start_workers, stop
 from benchmark.sweeps.progress import ProgressTracker, display
+from benchmark.sweeps.runs import overview
 from benchmark.sweeps.studies import Ledger
 
 # Seconds between two reads of the study

@@ -12,7 +12,7 @@ from benchmark.common.records import RUNS, STUDY, Record, read_records, write_re
 from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.study_trials import owned
 from benchmark.sweeps.study_view import StudyView
-from benchmark.sweeps.sweep_files import SweepError
+from benchmark.sweeps.validation import SweepError
 
 # Options with the paths of files and the URLs of databases, which may hold a password
 PRIVATE = ("--storage", "--logs", "--results")

@@ -4,7 +4,7 @@ import argparse
 import json
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
@@ -26,8 +26,9 @@ from stable_baselines3.common.vec_env import sync_envs_normalization
 from benchmark.common.environments import import_packages
 from benchmark.common.files import file_name
 from benchmark.common.records import EVALUATION_SEED, FINAL_EPISODES
-from benchmark.sweeps.experiments import Run
 from benchmark.sweeps.random_actions import register_random_actions
+from benchmark.sweeps.reporter import Report, Reporter
+from benchmark.sweeps.runs import Run
 from benchmark.sweeps.storages import STORAGE_ERRORS
 from sb3_cgp.common.files import write_atomically
 from sb3_cgp.resumption.algorithm import resumable
@@ -40,8 +41,6 @@ from sb3_cgp.zoo.resumed_run import ResumedExperiment
 SETTINGS = "run.json"
 # Errors that are no fault of the run: of the database, the disk, a missing package, or too little memory
 MACHINE_ERRORS = (*STORAGE_ERRORS, OSError, ImportError, DependencyNotInstalled, MemoryError, th.OutOfMemoryError)
-# Takes environment steps and the mean return of an evaluation
-Report = Callable[[int, float], None]
 
 
 def run_folder(logs: Path, study: str, run: Run) -> Path:
@@ -81,7 +80,7 @@ def train(run: Run, folder: Path, report: Report, watch: Callable[[int], None], 
         forget_states(folder)
         manager, model = _set_up(run, folder, device)
     (evaluation,) = (each for each in manager.callbacks if isinstance(each, EvalCallback))
-    manager.callbacks.append(_Reporter(evaluation, report, watch))
+    manager.callbacks.append(Reporter(evaluation, report, watch))
     manager.learn(model)
     manager.save_trained_model(model)
     final = _final_return(model, evaluation)
@@ -208,55 +207,3 @@ def _final_return(model: BaseAlgorithm, evaluation: EvalCallback) -> float:
     returns, _ = evaluate_policy(model, env, FINAL_EPISODES, deterministic=evaluation.deterministic)
     env.close()
     return float(np.mean(returns))
-
-
-class _Reporter(BaseCallback):
-    """Passes evaluations and steps on."""
-
-    def __init__(self, evaluation: EvalCallback, report: Report, watch: Callable[[int], None]):
-        super().__init__()
-        self._evaluation = evaluation
-        self._report = report
-        self._watch = watch
-        self._n_reported = 0
-
-    def _on_step(self) -> bool:
-        self._watch(self.num_timesteps)
-        self._report_new()
-        return True
-
-    def _on_training_end(self) -> None:
-        # A run that continues from its last step takes no other
-        self._report_new()
-
-    def _report_new(self) -> None:
-        timesteps, results = self._evaluation.evaluations_timesteps, self._evaluation.evaluations_results
-        for step, returns in _new_points(timesteps, results, self._n_reported):
-            self._report(step, float(np.mean(returns)))
-        self._n_reported = len(timesteps)
-
-    def get_training_state(self) -> dict[str, Any]:
-        """
-        Return an empty state: a run that continues reports all of its evaluations again.
-
-        :return: an empty dictionary
-        """
-        return {}
-
-    def set_training_state(self, state: dict[str, Any]) -> None:
-        """
-        Ignore the empty state.
-
-        :param state: an empty dictionary
-        """
-
-
-def _new_points(
-    timesteps: Sequence[int], results: Sequence[Sequence[float]], n_reported: int
-) -> list[tuple[int, Sequence[float]]]:
-    """Return the evaluations that were not reported, without those of offline policy training, which repeat the last step."""
-    return [
-        (timesteps[index], results[index])
-        for index in range(n_reported, len(timesteps))
-        if index == 0 or timesteps[index] > timesteps[index - 1]
-    ]

@@ -30,8 +30,9 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from benchmark.common.records import Record
-from benchmark.sweeps.experiments import Run, Sweep
+from benchmark.sweeps.experiments import Sweep
 from benchmark.sweeps.heartbeats import PROGRESS, SilenceDetector, TrialLostError, send_beat
+from benchmark.sweeps.runs import Run
 from benchmark.sweeps.storages import patiently
 from benchmark.sweeps.study_trials import (
     COMMAND,
@@ -48,7 +49,7 @@ from benchmark.sweeps.study_trials import (
     params_of,
 )
 from benchmark.sweeps.study_view import StudyView
-from benchmark.sweeps.sweep_files import SweepError
+from benchmark.sweeps.validation import SweepError
 
 
 class Ledger(StudyView):

@@ -8,8 +8,9 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, IntD
 from optuna.trial import FrozenTrial, TrialState
 
 from benchmark.common.records import Record
-from benchmark.sweeps.experiments import Run, Sweep
+from benchmark.sweeps.experiments import Sweep
 from benchmark.sweeps.heartbeats import PROGRESS
+from benchmark.sweeps.runs import Run
 
 # Attributes of a study: its description, and the prefix of those that each record a command that trained runs
 SWEEP, COMMAND = "sweep", "command "

@@ -7,7 +7,7 @@ from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial
 
 from benchmark.common.records import Record
-from benchmark.sweeps.experiments import Run, overview
+from benchmark.sweeps.runs import Run, overview
 from benchmark.sweeps.storages import patiently
 from benchmark.sweeps.study_trials import COMMAND, KEY, RUN, SWEEP, choices_of, owned, record_of, seconds_of
 

@@ -1,40 +1,24 @@
 """The form of the files in ``hyperparams/sweeps``, and the errors of a file that is not of this form."""
 
-from collections.abc import Sequence
-from pathlib import Path
 from string import Template
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
-import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
-from pydantic_core import ErrorDetails
+from huggingface_sb3 import EnvironmentName
+from pydantic import AfterValidator, BaseModel, Field, PositiveInt, model_validator
 from rl_zoo3 import ALGOS
 
 from benchmark.common.environments import (
-    check_distinct_names,
     import_packages,
     registered_environment,
     split_env_id,
 )
 from benchmark.sweeps.random_actions import register_random_actions
+from benchmark.sweeps.validation import Strict
 from sb3_cgp.zoo.registration import register
 
 Hyperparams = dict[str, Any]
 # The types of values that Optuna distinguishes
 Value = bool | int | float | str | None
-
-
-class SweepError(ValueError):
-    """
-    A sweep's file, or an option that changes it, is wrong.
-
-    :param place: the file, or the option
-    :param key: the key in the file, or the name of the option's value
-    :param problem: what is wrong, and what is allowed
-    """
-
-    def __init__(self, place: object, key: str, problem: str):
-        super().__init__(f"{place}: {key}: {problem}" if key else f"{place}: {problem}")
 
 
 def _known_algorithm(name: str) -> str:
@@ -54,7 +38,16 @@ def _imported(packages: list[str]) -> list[str]:
 
 
 def _with_distinct_names(tasks: list[str]) -> list[str]:
-    check_distinct_names(tasks)
+    ids: dict[str, str] = {}
+    for env_id in tasks:
+        # The name in rl_zoo3's folders
+        name = str(EnvironmentName(env_id))
+        if name in ids:
+            raise ValueError(
+                f"{ids[name]!r} and {env_id!r} have the same name in rl_zoo3's folders, {name}: run them as two sweeps, with "
+                "a --study for each"
+            )
+        ids[name] = env_id
     return tasks
 
 
@@ -71,13 +64,7 @@ def _all_different(values: list[Any]) -> list[Any]:
     return values
 
 
-class _Strict(BaseModel):
-    """Data with no keys but those that are declared."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Packages(_Strict):
+class Packages(Strict):
     """
     Packages that a command line names.
 
@@ -87,7 +74,7 @@ class Packages(_Strict):
     gym_packages: Annotated[list[str], AfterValidator(_imported)]
 
 
-class Method(_Strict):
+class Method(Strict):
     """
     A method to compare.
 
@@ -97,11 +84,11 @@ class Method(_Strict):
     """
 
     algo: Annotated[str, AfterValidator(_known_algorithm)]
-    hyperparams: Annotated[Hyperparams, AfterValidator(_with_numbers)] = {}
+    hyperparams: Annotated[Hyperparams, AfterValidator(_with_numbers)] = Field(default_factory=dict)
     tuned: bool = False
 
 
-class Axis(_Strict):
+class Axis(Strict):
     """
     An axis of a sweep: the hyperparameters that are varied, and their values.
 
@@ -113,7 +100,7 @@ class Axis(_Strict):
 
     values: Annotated[list[Value], Field(min_length=1)] | Annotated[dict[str, Hyperparams], Field(min_length=1)]
     sets: Hyperparams | None = None
-    sets_for: dict[str, Hyperparams] = {}
+    sets_for: dict[str, Hyperparams] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _check(self) -> "Axis":
@@ -157,7 +144,7 @@ def _fill(template: Any, value: Any) -> Any:
         raise ValueError(f"`sets` has {template!r}, but only $value stands for something ($$ is a dollar sign)") from error
 
 
-class SweepFile(_Strict):
+class SweepFile(Strict):
     """
     The content of a sweep's file.
 
@@ -176,10 +163,12 @@ class SweepFile(_Strict):
     :param exclude: combinations of the axes' values to leave out
     """
 
+    parts: ClassVar[dict[str, type[BaseModel]]] = {"axes": Axis, "methods": Method}
+
     title: str
     methods: Annotated[list[str], Field(min_length=1)] | Annotated[dict[str, Method], Field(min_length=1)]
     # Before the tasks, which are validated in this order
-    gym_packages: Annotated[list[str], AfterValidator(_imported)] = []
+    gym_packages: Annotated[list[str], AfterValidator(_imported)] = Field(default_factory=list)
     tasks: Annotated[
         list[Annotated[str, AfterValidator(registered_environment)]],
         Field(min_length=1),
@@ -194,9 +183,9 @@ class SweepFile(_Strict):
     evaluation_interval: PositiveInt
     evaluation_episodes: PositiveInt = 10
     checkpoint_interval: PositiveInt | None = None
-    hyperparams: Hyperparams = {}
-    axes: dict[str, Axis] = {}
-    exclude: list[dict[str, Any]] = []
+    hyperparams: Hyperparams = Field(default_factory=dict)
+    axes: dict[str, Axis] = Field(default_factory=dict)
+    exclude: list[dict[str, Any]] = Field(default_factory=list)
 
     @model_validator(mode="before")
     @classmethod
@@ -233,7 +222,7 @@ class SweepFile(_Strict):
         return self
 
 
-class Inclusion(_Strict):
+class Inclusion(Strict):
     """
     A file that stands for several sweeps.
 
@@ -243,58 +232,3 @@ class Inclusion(_Strict):
 
     title: str
     includes: Annotated[list[str], Field(min_length=1)]
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """
-    Read a file of keys and values.
-
-    :param path: the file
-    :return: its content
-    :raises SweepError: if it cannot be read, or holds no mapping
-    """
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, yaml.YAMLError) as error:
-        raise SweepError(path, "", f"cannot be read: {error}") from error
-    if not isinstance(content, dict):
-        raise SweepError(path, "", "must be a mapping of keys to values")
-    return content
-
-
-def validated(kind: type[Any], content: Any, place: object, *keys: str) -> Any:
-    """
-    Return the validated model of data.
-
-    :param kind: the model's class
-    :param content: the data
-    :param place: the file or the option that the data comes from
-    :param keys: the keys that lead to the data there
-    :return: the model
-    :raises SweepError: if the data does not fit
-    """
-    try:
-        return kind.model_validate(content)
-    except ValidationError as error:
-        problems = [(".".join([*keys, *_location(each)]), _problem(each, kind)) for each in _telling(error.errors())]
-        raise SweepError(place, problems[0][0], "; ".join(dict.fromkeys(problem for _, problem in problems))) from error
-
-
-def _telling(errors: Sequence[ErrorDetails]) -> Sequence[ErrorDetails]:
-    """Return the errors without those of another alternative, such as that a list is no mapping, where this is possible."""
-    telling = [each for each in errors if each["type"] not in ("list_type", "dict_type", "model_type", "int_type")]
-    return telling or errors
-
-
-def _location(error: ErrorDetails) -> list[str]:
-    # The names of alternatives are pydantic's own
-    return [str(part) for part in error["loc"] if not str(part).startswith(("list[", "dict[", "constrained-"))]
-
-
-def _problem(error: ErrorDetails, kind: type[BaseModel]) -> str:
-    given = "" if error["type"] == "missing" or isinstance(error["input"], dict) else f" (it is {error['input']!r})"
-    if error["type"] == "extra_forbidden":
-        owners: dict[str, type[BaseModel]] = {"axes": Axis, "methods": Method}
-        owner = owners.get(str(error["loc"][0]), kind)
-        return f"is not known: it must be one of {', '.join(owner.model_fields)}"
-    return error["msg"].removeprefix("Value error, ") + given

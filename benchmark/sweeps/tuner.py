@@ -23,8 +23,8 @@ from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, run_folder, trai
 from benchmark.sweeps.scoring import PRUNERS, SCORING
 from benchmark.sweeps.storages import patiently
 from benchmark.sweeps.study_trials import ERROR, OUTCOME
-from benchmark.sweeps.sweep_files import SweepError
 from benchmark.sweeps.tuning import ORIGIN, SCORES, Tuning
+from benchmark.sweeps.validation import SweepError
 
 # The outcome of a trial whose configuration is to be continued
 STOPPED = "given back: its process was stopped"

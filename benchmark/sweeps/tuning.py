@@ -9,7 +9,7 @@ from optuna.trial import FrozenTrial
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
 from benchmark.sweeps.entries import sampled_entry
-from benchmark.sweeps.experiments import Run
+from benchmark.sweeps.runs import Run
 from benchmark.sweeps.sweep_files import Hyperparams
 
 # Attributes of a trial: the scores of its seeds so far, and the number of its configuration's first trial
