@@ -1,5 +1,5 @@
 """
-Measure what bfloat16 changes: the share of CEM's elites that differ from float32's on a trained critic, and final rewards.
+Measure the effect of bfloat16: the share of CEM's elites that differ from float32's on a trained critic, and final rewards.
 
 ``python -m benchmark.precision`` trains with both data types and writes a record per run, then ``precision.md``. Runs that
 have their record are not repeated, so that it can be interrupted, and run in several processes with different seeds.
@@ -40,7 +40,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """
-    Train what has no record yet, and write the tables of all records.
+    Train the runs that have no record yet, and write the tables of all records.
 
     :param argv: the command line; None for that of the process
     """

@@ -2,7 +2,7 @@
 Execute a sweep, or continue it: ``python -m benchmark.sweep e3 --task Pendulum-v1 --steps 3000 --seeds 2 --workers 2``.
 
 The runs are trials of an Optuna study. The same command, given again after any interruption, or on other machines with the
-same ``--storage``, trains what is not finished. At the end it exports the runs and draws the figures.
+same ``--storage``, trains the runs that are left. At the end it exports the runs and draws the figures.
 """
 
 import argparse

@@ -102,7 +102,7 @@ def tuning_of(args: argparse.Namespace) -> Tuning:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """
-    Tune.
+    Tune hyperparameters.
 
     :param argv: the command line; None for that of the process
     """
@@ -128,10 +128,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         best = tune(tuner, study, args, argv)
         entry = tuning.entry(best)
         scores = ", ".join(f"{score:.4g}" for score in best.user_attrs[SCORES])
-        said = f"benchmark.tune, trial {best.number}: {args.score} of {args.seeds} seeds {best.values[0]:.4g} ({scores})"
-        print(said, *(f"  {name}: {value!r}" for name, value in sorted(entry.items())), sep="\n")
+        summary = f"benchmark.tune, trial {best.number}: {args.score} of {args.seeds} seeds {best.values[0]:.4g} ({scores})"
+        print(summary, *(f"  {name}: {value!r}" for name, value in sorted(entry.items())), sep="\n")
         if args.write is not None:
-            write_entry(args.write, tuning.task, entry, said)
+            write_entry(args.write, tuning.task, entry, summary)
     except (ImportError, ValueError) as error:
         sys.exit(f"Error: {error}")
     except STORAGE_ERRORS as error:

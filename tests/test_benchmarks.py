@@ -5,18 +5,20 @@ import re
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium.utils.env_checker import check_env
 from matplotlib.image import imread
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from tables import unpadded
 from torch import nn
 
-from benchmark import latency, runtime, scaling, selector
+from benchmark import checkpoint, latency, runtime, scaling, selector
 from benchmark.common import arguments
-from benchmark.speed import cem_calls, contenders, latencies, products, run_times, scaling_points
+from benchmark.speed import cem_calls, checkpoints, contenders, latencies, products, run_times, scaling_points
 from benchmark.speed.boxes import BoxEnv
 from benchmark.speed.plain import PlainPolicy
 from benchmark.speed.products import Sizes
@@ -25,7 +27,7 @@ from sb3_cgp import CGP
 from sb3_cgp.core.policies import repeated_q_score
 
 CPU = th.device("cpu")
-COMMANDS = {"latency": latency, "runtime": runtime, "selector": selector, "scaling": scaling}
+COMMANDS = {"checkpoint": checkpoint, "latency": latency, "runtime": runtime, "selector": selector, "scaling": scaling}
 
 
 def test_turns_rotate_and_the_burn_in_is_not_timed():
@@ -360,6 +362,38 @@ def test_latency_is_of_single_actions_that_agree(tmp_path):
     actions = [act(observation) for act in latencies.ways_to_act(model, tmp_path / "export", threads=1).values()]
     assert [action.shape for action in actions] == [(1,)] * 3
     assert np.allclose(actions, actions[0], atol=1e-4)
+
+
+def test_a_checkpoint_is_of_a_full_buffer_and_of_all_steps_since_the_last(tmp_path, monkeypatch):
+    steps = []
+    save = checkpoints.StateStore.save
+
+    def counting(self, step, state):
+        steps.append(step)
+        return save(self, step, state)
+
+    monkeypatch.setattr(checkpoints.StateStore, "save", counting)
+    options = "--env Pendulum-v1 --transitions 200 --new 10 --rounds 2 --device cpu"
+    record = run_command("checkpoint", tmp_path, *options.split())
+    assert steps == [0, 10, 20, 30, 40, 50]
+    seconds = record["measured"]["seconds"]
+    assert list(seconds) == ["first", "second", "later", "load"]
+    assert all(len(each["all"]) == 2 and min(each["all"]) > 0.0 for each in seconds.values())
+    # 200 transitions of 3 + 3 + 1 + 1 numbers, at the least
+    assert record["measured"]["bytes"] > 200 * 8 * 4
+    assert "a replay buffer of 200 transitions" in (tmp_path / "checkpoint.md").read_text()
+
+
+def test_a_buffer_is_filled_around_its_end():
+    buffer = ReplayBuffer(10, gym.spaces.Box(-1, 1, (2,)), gym.spaces.Box(-1, 1, (1,)))
+    generator = np.random.default_rng(0)
+    checkpoints.fill(buffer, 7, generator)
+    assert (buffer.pos, buffer.full) == (7, False)
+    before = buffer.rewards.copy()
+    checkpoints.fill(buffer, 5, generator)
+    assert (buffer.pos, buffer.full) == (2, True)
+    changed = (buffer.rewards != before).ravel()
+    assert changed.tolist() == [True] * 2 + [False] * 5 + [True] * 3
 
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space:UserWarning")

@@ -16,11 +16,12 @@ from optuna.storages import InMemoryStorage, RDBStorage
 from optuna.trial import TrialState
 from studies import GRACE, Clock, Crew, assert_each_run_once, make_sweep, mortal, pretend, pretend_to_train, work_through
 
+import benchmark.worker
 from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.heartbeats import PROGRESS, TrialLostError
 from benchmark.sweeps.storages import open_storage, patiently
 from benchmark.sweeps.studies import Ledger
-from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME
+from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME, WORKER
 from benchmark.sweeps.validation import SweepError
 from benchmark.sweeps.worker_loop import execute_runs
 
@@ -389,3 +390,19 @@ def test_by_way_of_optunas_proxy(monkeypatch, tmp_path):
         for server in servers:
             server.send_signal(signal.SIGKILL)
             server.wait()
+
+
+def test_the_workers_command_trains_all_runs_of_a_study(tmp_path, monkeypatch):
+    url = f"sqlite:///{tmp_path}/studies.db"
+    ledger = Ledger(open_storage(url), "study", GRACE)
+    sweep = make_sweep()
+    ledger.open(sweep, {"experiment": sweep.name})
+    handled = []
+    monkeypatch.setattr("signal.signal", lambda number, handler: handled.append(number))
+    monkeypatch.setattr(worker, "train", pretend_to_train)
+    benchmark.worker.main(["--study", "study", "--storage", url, "--logs", str(tmp_path), "--device", "cpu"])
+    assert handled == [signal.SIGTERM, signal.SIGINT]
+    assert_each_run_once(ledger.trials(), sweep)
+    assert {trial.user_attrs[WORKER] for trial in ledger.trials()} == {f"{socket.gethostname()}:{os.getpid()}"}
+    with pytest.raises(ValueError, match="must be more than two heartbeats"):
+        benchmark.worker.main(["--study", "study", "--storage", url, "--logs", str(tmp_path), "--grace", "1"])

@@ -409,3 +409,51 @@ def test_the_command_writes_what_rl_zoo3_trains(tmp_path, monkeypatch):
     model = ALGOS["cgp"].load(tmp_path / "zoo" / "cgp" / "Pendulum-v1_1" / "Pendulum-v1.zip")
     assert 60 <= model.num_timesteps < 70
     assert (model.gamma, model.cem_samples) == (entry["gamma"], 8)
+
+
+class Process:
+    """A process that has ended."""
+
+    def poll(self):
+        return 0
+
+
+@pytest.mark.parametrize(
+    ("scores", "message"),
+    [
+        ([1.0, 3.0], None),
+        ([1.0], r"All processes have ended too early: .*worker-\*\.log say why\. The same command continues\."),
+        ([None, None], r"No configuration was scored: 2 of 2 configurations over \(0 pruned, 2 failed\)"),
+    ],
+)
+def test_the_command_says_how_a_tuning_ended(tmp_path, monkeypatch, capsys, pretend, scores, message):
+    """... when its processes, which this one stands for, have ended."""
+    storage, left = InMemoryStorage(), iter(scores)
+    monkeypatch.setattr(tune, "open_storage", lambda url: storage)
+    monkeypatch.setattr("signal.signal", lambda *args: None)
+
+    def score(run):
+        value = next(left)
+        if value is None:
+            raise FloatingPointError("NaN")
+        return value
+
+    pretend(score)
+
+    def start_workers(command, n_workers, threads, folder):
+        assert command[1:3] == ["-m", "benchmark.tune"]
+        assert command[-2:] == ["--parent", str(os.getpid())]
+        args = tune.parse(arguments("--logs", str(tmp_path), "--parent", str(os.getppid()), trials=len(scores), seeds=1))
+        own = Tuner(storage, "tune-td3-Pendulum-v1", tune.tuning_of(args), 60.0)
+        tune_execution.execute_trials(own, args)
+        return [Process()]
+
+    monkeypatch.setattr(tune_execution, "start_workers", start_workers)
+    argv = arguments("--logs", str(tmp_path), "--write", str(tmp_path / "best.yml"), seeds=1)
+    if message is not None:
+        with pytest.raises(SystemExit, match=message):
+            tune.main(argv)
+        return
+    tune.main(argv)
+    assert "benchmark.tune, trial 1: mean of 1 seeds 3 (3)" in capsys.readouterr().out
+    assert yaml.safe_load((tmp_path / "best.yml").read_text())["Pendulum-v1"]["batch_size"] == 8

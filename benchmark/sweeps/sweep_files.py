@@ -106,7 +106,7 @@ class Axis(Strict):
     def _check(self) -> "Axis":
         if isinstance(self.values, dict):
             if self.sets is not None or self.sets_for:
-                raise ValueError("`sets` and `sets_for` are for a list of values: named values say what they set themselves")
+                raise ValueError("`sets` and `sets_for` are for a list of values: named values set their own hyperparameters")
         elif len(set(map(str, self.values))) < len(self.values):
             raise ValueError("`values` must differ from each other, also when they are written out")
         for template in (self.sets or {}, *self.sets_for.values()):
