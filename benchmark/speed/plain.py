@@ -7,8 +7,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_cgp.core.cem import Selection
-from sb3_cgp.core.policies import CGPPolicy
-from sb3_cgp.core.policies import repeated_q_score
+from sb3_cgp.core.policies import CGPPolicy, repeated_q_score
 
 
 class PlainPolicy(CGPPolicy):
@@ -33,4 +32,5 @@ class PlainPolicy(CGPPolicy):
         """
         features = critic.extract_features(observation, critic.features_extractor)
         score = repeated_q_score(critic.q_networks[0], features)
+        assert self.selector is not None
         return self.selector.select(score, len(features), get_action_dim(self.action_space), features.device)
