@@ -1,196 +1,40 @@
 """
-Draw the figures of sweeps, and write what they say on a page.
+Draw the figures of sweeps, and write the page on their results.
 
-``python -m benchmark.figures benchmark/results/sweeps/e3 …`` takes studies' folders, or names of studies in a storage, and
-writes ``results.md`` and ``figures/`` into the results' folder. Which figures a study gets follows from its runs.
+``python -m benchmark.figures benchmark/results/sweeps/e3 …`` takes the folders of studies, or names of studies in a storage,
+and writes ``results.md`` and ``figures/`` into the folder of the results.
 """
 
 import argparse
-import itertools
-import json
-import re
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from benchmark.common.arguments import count, output_folder
-from benchmark.common.records import RUNS
-from benchmark.reporting.claims import findings
-from benchmark.reporting.drawing import final_rewards, learning_curves, sensitivity, stability, values
 from benchmark.reporting.estimates import REPETITIONS
-from benchmark.reporting.page import Picture, claims_section, page, pooled_section, study_section
-from benchmark.reporting.scores import Study, axis_in_words, longest, read_study, score_table
-from sb3_cgp.common.files import write_atomically
-
-FOLDER = Path("benchmark/results/sweeps")
-RUNTIME = Path(__file__).parent / "results/runtime/runtime.json"
-PAGE = "results.md"
-FIGURES = "figures"
-FIGURES_ONLY = "--figures-only"
-STABILITY = "Stability: the share of runs, {}, that reach at least a final reward, with pointwise 95 % bands."
-
-
-def study_folders(out: Path = FOLDER) -> list[Path]:
-    """
-    Find the studies in a folder.
-
-    :param out: the folder
-    :return: their folders, by name
-    """
-    return sorted(runs.parent for runs in out.glob(f"*/{RUNS}"))
-
-
-def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPETITIONS, with_page: bool = True) -> Path:
-    """
-    Draw the figures of studies, and write their page.
-
-    :param folders: the studies' folders
-    :param out: where the page and the figures go
-    :param repetitions: how often the bootstrap draws runs
-    :param with_page: whether the page is written; if not, one that is there stays
-    :return: the page
-    :raises FileNotFoundError: if a folder holds no study
-    :raises ValueError: if two have the same name
-    """
-    studies = [read_study(folder) for folder in folders]
-    names = [study.name for study in studies]
-    if len(set(names)) < len(names):
-        raise ValueError(f"Two of these studies have the same name: {', '.join(names)}")
-    in_earnest = longest(studies)
-    together = stability_together(in_earnest, repetitions)
-    pictures = [draw(study, repetitions) for study in studies]
-    for picture in [*together, *itertools.chain(*pictures)]:
-        write_atomically(out / picture.path, picture.content)
-    if with_page:
-        found = findings(score_table(in_earnest), read_runtime(), repetitions)
-        command = command_line(folders, out, repetitions)
-        sections = [f"`{command}` writes this page.", claims_section(found)]
-        sections += [pooled_section(picture, f"{command} {FIGURES_ONLY}") for picture in together]
-        for study, own in zip(studies, pictures, strict=True):
-            # A study's figures depend on nothing else
-            command = f"{command_line([study.folder], out, repetitions)} {FIGURES_ONLY}"
-            sections.append(study_section(study, own, command, repetitions))
-        write_atomically(out / PAGE, page(sections).encode())
-    return out / PAGE
-
-
-def command_line(folders: Sequence[Path], out: Path, repetitions: int) -> str:
-    """
-    Write the command that draws the same.
-
-    :param folders: the studies' folders
-    :param out: where the page and the figures go
-    :param repetitions: how often the bootstrap draws runs
-    :return: the command
-    """
-
-    def shown(path: Path) -> str:
-        here = Path.cwd()
-        return (path.resolve().relative_to(here) if path.resolve().is_relative_to(here) else path).as_posix()
-
-    arguments = [shown(folder) for folder in folders]
-    if shown(out) != FOLDER.as_posix():
-        arguments += ["--folder", shown(out)]
-    if repetitions != REPETITIONS:
-        arguments += ["--repetitions", str(repetitions)]
-    return shlex.join(["python", "-m", "benchmark.figures", *arguments])
-
-
-def read_runtime() -> dict[str, Any] | None:
-    """
-    Read the times that ``benchmark.runtime`` measured.
-
-    :return: its record; None if there is none
-    """
-    return json.loads(RUNTIME.read_text()) if RUNTIME.is_file() else None
-
-
-def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
-    """
-    Draw a study's figures: with axes, its stability and its sensitivity; without, its learning curves and final rewards.
-
-    :param study: the study
-    :param repetitions: how often the bootstrap draws runs
-    :return: the figures; none before the first run has ended
-    """
-    if not study.records:
-        return []
-    table = score_table([study])
-
-    def picture(kind: str, caption: str, content: bytes) -> Picture:
-        # Some tasks have a slash in their name
-        folder, name = (re.sub(r"[^\w.-]+", "_", text) for text in (study.name, kind))
-        return Picture(f"{FIGURES}/{folder}/{name}.png", caption, content)
-
-    if not study.axes:
-        curve = (
-            "Learning curves on {}: mean and range over seeds (left), interquartile mean and 95 % interval (right). "
-            "Until an offline variant's policy is trained, at the end, its curve is CEM's."
-        )
-        final = "Final rewards: interquartile mean, its 95 % interval, and every run as a stroke."
-        return [
-            *(
-                picture(f"learning_curves_{task}", curve.format(task), learning_curves(study, task, repetitions))
-                for task in study.tasks
-            ),
-            picture("final_rewards", final, final_rewards(study, table, repetitions)),
-        ]
-
-    axes = " and ".join(axis_in_words(axis) for axis in study.axes)
-    caption = STABILITY.format("of all configurations and seeds")
-    pictures = [picture("stability", caption, stability(table, study.methods, repetitions))]
-    for task in study.tasks:
-        lines = f"Sensitivity to {axes} on {task}: learning curves, means over seeds."
-        pictures.append(picture(f"sensitivity_{task}", lines, sensitivity(study, task)))
-        points = f"Final rewards on {task} by {axes}: interquartile means over all runs with a value, and 95 % intervals."
-        pictures.append(picture(f"values_{task}", points, values(study, table, task, repetitions)))
-    return pictures
-
-
-def stability_together(studies: Sequence[Study], repetitions: int = REPETITIONS) -> list[Picture]:
-    """
-    Draw the stability of several sweeps together.
-
-    Those that compare two methods in common belong together; what shares one method only answers another question.
-
-    :param studies: the studies
-    :param repetitions: how often the bootstrap draws runs
-    :return: the figure of the largest group of sweeps; none if there is no group of two
-    """
-    groups: list[list[Study]] = []
-    for study in studies:
-        if study.axes:
-            fitting = [group for group in groups if any(len({*study.methods} & {*other.methods}) >= 2 for other in group)]
-            groups = [group for group in groups if group not in fitting]
-            groups.append([member for group in fitting for member in group] + [study])
-    largest = max(groups, key=len, default=[])
-    if len(largest) < 2:
-        return []
-    methods = list(dict.fromkeys(method for study in largest for method in study.methods))
-    caption = STABILITY.format(f"of all sweeps ({', '.join(study.name for study in largest)}) that name the method")
-    return [Picture(f"{FIGURES}/stability.png", caption, stability(score_table(largest), methods, repetitions))]
+from benchmark.reporting.figures import FIGURES, FIGURES_ONLY, FOLDER, figures, study_folders
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """
-    Draw the studies that the command line names.
+    Draw the figures of the studies that the command line names, and write their page.
 
-    :param argv: the command line; None for the process's own
+    :param argv: the command line; None for that of the process
     """
-    parser = argparse.ArgumentParser(prog="python -m benchmark.figures", description="Draw and report on sweeps.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmark.figures", description="Draw the figures of sweeps, and write the page on their results."
+    )
     parser.add_argument(
         "studies", nargs="*", metavar="STUDY", help="a study's folder, or its name in the storage (default: all in --folder)"
     )
-    parser.add_argument("--folder", type=output_folder, default=FOLDER, help="where the results go (default: %(default)s)")
-    parser.add_argument("--storage", help="where named studies are: a database's URL")
+    parser.add_argument("--folder", type=output_folder, default=FOLDER, help="folder of the results (default: %(default)s)")
+    parser.add_argument("--storage", help="URL of the database that holds named studies")
     parser.add_argument(
-        "--repetitions", type=count, default=REPETITIONS, help="how often the bootstrap draws runs (default: %(default)s)"
+        "--repetitions", type=count, default=REPETITIONS, help="number of bootstrap samples (default: %(default)s)"
     )
     parser.add_argument(FIGURES_ONLY, action="store_true", help="draw the figures, and leave the page as it is")
     args = parser.parse_args(argv)
-    # Where the shell names all folders, it names that of the figures, too
+    # A shell's * names the folder of the figures, too
     named = [study for study in args.studies if Path(study) != args.folder / FIGURES]
     try:
         folders = [find(study, args.storage, args.folder) for study in named] or study_folders(args.folder)
@@ -203,20 +47,20 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def find(study: str, storage: str | None, out: Path) -> Path:
     """
-    Find a study's folder; make it if the study is in a storage.
+    Return a study's folder; export the study into it if it is in a storage.
 
     :param study: its folder or its name
-    :param storage: the storage
-    :param out: where its folder is made
+    :param storage: the URL of the storage; None for a study that is a folder
+    :param out: the folder of all results
     :return: its folder
-    :raises FileNotFoundError: if there is no such folder, and no storage was named or it has no such study
+    :raises FileNotFoundError: if the folder is missing, or the storage has no such study
     """
     if storage is None:
         for folder in (Path(study), out / study):
             if folder.is_dir():
                 return folder
         raise FileNotFoundError(f"{study} is no folder; to take a study of that name from a storage, name it with --storage")
-    # Optuna takes a second to import
+    # Optuna takes a second to import, and only studies of a storage need it
     from benchmark.sweeps.exports import export_study
 
     try:

@@ -1,20 +1,21 @@
 """
-What ``make train`` must know before rl_zoo3 starts: how often to evaluate, and which number the run will get.
+Plan a training run for ``make train`` before rl_zoo3 starts: the evaluation interval, and the number of the run.
 
 ``python -m benchmark.plan --algo cgp --env Pendulum-v1`` prints both on one line, as in ``250 1``.
 """
 
 import argparse
 import os
+import sys
 from collections.abc import Sequence
-from contextlib import redirect_stdout
 
 import gymnasium as gym
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import ALGOS, get_latest_run_id
-from rl_zoo3.exp_manager import ExperimentManager
 
 from benchmark.common.arguments import count
+from benchmark.common.environments import import_packages, split_env_id
+from benchmark.common.zoo import read_entry
 
 EVALUATIONS_PER_RUN = 20
 LONGEST_INTERVAL = 10_000
@@ -22,22 +23,18 @@ LONGEST_INTERVAL = 10_000
 
 def configured_steps(algo: str, env_id: str) -> int:
     """
-    Read how long rl_zoo3 would train, from the YAML file that it would read itself.
+    Return the number of environment steps in the YAML file that rl_zoo3 would read.
 
     :param algo: the algorithm's name in rl_zoo3
     :param env_id: a registered environment
     :return: the number of environment steps
     """
-    manager = ExperimentManager(argparse.Namespace(), algo, env_id, log_folder="")
-    # rl_zoo3 prints the hyperparameters that it reads, and prints them again when it trains
-    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
-        hyperparams, _ = manager.read_hyperparameters()
-    return int(hyperparams["n_timesteps"])
+    return int(read_entry(algo, env_id)["n_timesteps"])
 
 
 def evaluation_interval(steps: int) -> int:
     """
-    Choose an interval that gives short runs a usable learning curve and long ones the paper's.
+    Return the interval that gives short runs a usable learning curve, and long ones the paper's.
 
     :param steps: the length of the run in environment steps
     :return: environment steps from one evaluation to the next
@@ -47,16 +44,16 @@ def evaluation_interval(steps: int) -> int:
 
 def planned_interval(algo: str, env_id: str, steps: int | None) -> int:
     """
-    Choose the evaluation interval of a run that has not started.
+    Return the evaluation interval of a run that has not started.
 
     :param algo: the algorithm's name in rl_zoo3
     :param env_id: the environment
-    :param steps: the number of steps asked for; None for what the YAML file says
+    :param steps: the number of environment steps; None for that of the YAML file
     :return: environment steps from one evaluation to the next
     """
     if steps is not None:
         return evaluation_interval(steps)
-    # Not ours to refuse: rl_zoo3.train suggests the nearest name, or knows the environment from --gym-packages
+    # rl_zoo3.train suggests the nearest name, or knows the environment from --gym-packages
     if env_id not in gym.registry:
         return LONGEST_INTERVAL
     return evaluation_interval(configured_steps(algo, env_id))
@@ -64,8 +61,8 @@ def planned_interval(algo: str, env_id: str, steps: int | None) -> int:
 
 def next_run_id(folder: str, algo: str, env_id: str) -> int:
     """
-    Tell the number that rl_zoo3 will give to the next run. With it, a run that ends
-    can be reported although a later one has been started beside it.
+    Return the number that rl_zoo3 will give to the next run. By this number, a run can be reported although a later one has
+    been started in the meantime.
 
     :param folder: rl_zoo3's log folder
     :param algo: the algorithm's name in rl_zoo3
@@ -79,14 +76,25 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     Print the evaluation interval and the next run's number.
 
-    :param argv: the command line; None for the process's own
+    :param argv: the command line; None for that of the process
     """
     parser = argparse.ArgumentParser(prog="python -m benchmark.plan", description="Plan a training run of rl_zoo3.")
     parser.add_argument("--algo", default="cgp", choices=list(ALGOS), help="algorithm (default: %(default)s)")
     parser.add_argument("--env", default="Pendulum-v1", help="environment (default: %(default)s)")
     parser.add_argument("--folder", default="logs", help="rl_zoo3's log folder (default: %(default)s)")
-    parser.add_argument("--steps", type=count, help="length of the run (default: what the YAML file says)")
+    parser.add_argument("--steps", type=count, help="length of the run (default: that of the YAML file)")
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="modules to import, which register environments")
     args = parser.parse_args(argv)
+    try:
+        modules, env_id = split_env_id(args.env)
+        if modules:
+            # rl_zoo3.train looks for the whole id in the registry
+            raise ValueError(
+                f'rl_zoo3 does not import modules of ids: train ENV={env_id} with ARGS="--gym-packages {modules[0]}"'
+            )
+        import_packages(args.gym_packages)
+    except (ImportError, ValueError) as error:
+        sys.exit(f"Error: {error}")
     print(planned_interval(args.algo, args.env, args.steps), next_run_id(args.folder, args.algo, args.env))
 
 

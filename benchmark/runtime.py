@@ -1,154 +1,19 @@
 """
-The paper's run-time table on this machine: seconds per episode of training and of inference, and ratios to TD3.
+Measure the paper's run-time table on this machine: seconds per episode of training and of inference, and ratios to TD3.
 
 ``python -m benchmark.runtime`` writes ``runtime.md`` and ``runtime.json``.
 """
 
 import argparse
-import os
-import sys
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-import torch as th
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-
-from benchmark.common.arguments import continuous_environment, count, measuring_parser
-from benchmark.common.files import publish
-from benchmark.common.provenance import conditions
-from benchmark.speed.contenders import CONTENDERS, REFERENCE, RandomAgent, make_agent, takes_cem_dtype
+from benchmark.common.arguments import continuous_environment, count
+from benchmark.common.measuring import measure_and_publish, measuring_parser
+from benchmark.speed.contenders import CONTENDERS
+from benchmark.speed.run_times import measure
 from benchmark.speed.runtime_table import markdown
-from benchmark.speed.timing import interleaved, ratio, summary
 
-# Episodes between two entries in the log: none is ever written
-NO_LOG = 10**9
-# Arguments that the record repeats
 RECORDED = ("env", "seed", "episode_steps", "episodes", "inference_episodes", "cem_dtype")
-
-
-def prepare(agents: dict[str, OffPolicyAlgorithm], steps: int) -> None:
-    """
-    Train for a while, until every first time is over: filling the buffer, compiling, capturing.
-
-    :param agents: the models, untrained
-    :param steps: environment steps
-    """
-    for agent in agents.values():
-        agent.learn(steps, log_interval=NO_LOG)
-
-
-def training_episode(agent: OffPolicyAlgorithm, steps: int) -> Callable[[], object]:
-    """
-    Make a training episode, which goes on where the last one ended.
-
-    :param agent: the model
-    :param steps: environment steps per episode
-    :return: the function to time
-    """
-    return lambda: agent.learn(steps, log_interval=NO_LOG, reset_num_timesteps=False)
-
-
-def inference_episode(agent: OffPolicyAlgorithm | RandomAgent, env_id: str, seed: int, steps: int) -> Callable[[], object]:
-    """
-    Make an inference episode, which goes on where the last one ended.
-
-    :param agent: the model
-    :param env_id: the environment, of which it gets one of its own
-    :param seed: the environment's seed
-    :param steps: environment steps per episode
-    :return: the function to time
-    """
-    env = make_vec_env(env_id, seed=seed)
-    observation = env.reset()
-
-    def episode() -> None:
-        nonlocal observation
-        for _ in range(steps):
-            action, _ = agent.predict(observation, deterministic=True)  # type: ignore[arg-type]
-            observation, *_ = env.step(action)
-
-    return episode
-
-
-def make_agents(args: argparse.Namespace) -> tuple[dict[str, OffPolicyAlgorithm | RandomAgent], dict[str, str]]:
-    """
-    Make the models of the methods asked for.
-
-    :param args: the command line
-    :return: the models, and why others could not be made
-    """
-    agents: dict[str, OffPolicyAlgorithm | RandomAgent] = {}
-    missing = {}
-    for name in args.methods:
-        kwargs = {"cem_dtype": args.cem_dtype} if args.cem_dtype is not None and takes_cem_dtype(name) else {}
-        env = make_vec_env(args.env, seed=args.seed)
-        try:
-            agents[name] = make_agent(name, env, args.episode_steps, args.seed, args.device, **kwargs)
-        except ImportError as error:
-            missing[name] = f"not measured: {error}"
-    return agents, missing
-
-
-def measure(args: argparse.Namespace) -> dict[str, Any]:
-    """
-    Measure the methods asked for.
-
-    :param args: the command line
-    :return: what was measured, by method
-    """
-    agents, missing = make_agents(args)
-    steps, burn_in = args.episode_steps, burn_in_steps(args.episode_steps)
-    learners = {name: agent for name, agent in agents.items() if isinstance(agent, OffPolicyAlgorithm)}
-    prepare(learners, steps + burn_in)
-    updates_before = {name: agent._n_updates for name, agent in learners.items()}
-    training = {name: training_episode(agent, steps) for name, agent in learners.items()}
-    train_seconds = interleaved(training, args.episodes, burn_in=0, device=args.device, title="training")
-    inference = {name: inference_episode(agent, args.env, args.seed, steps) for name, agent in agents.items()}
-    inference_seconds = interleaved(inference, args.inference_episodes, device=args.device, title="inference")
-
-    methods: dict[str, Any] = {}
-    for name in args.methods:
-        if name in missing:
-            methods[name] = {"missing": missing[name]}
-            continue
-        contender = CONTENDERS[name]
-        methods[name] = {
-            "train": figures(train_seconds, name, contender.paper_train),
-            "inference": figures(inference_seconds, name, contender.paper_inference),
-        }
-        if name in learners:
-            methods[name]["timed_gradient_steps"] = learners[name]._n_updates - updates_before[name]
-    return methods
-
-
-def burn_in_steps(episode_steps: int) -> int:
-    """
-    Choose how many gradient steps go untimed before the first timed one.
-
-    :param episode_steps: environment steps per episode
-    :return: a fifth of an episode
-    """
-    return max(episode_steps // 5, 1)
-
-
-def figures(seconds: dict[str, list[float]], name: str, paper_ratio: float | None) -> dict[str, Any] | None:
-    """
-    Put together what is known of one method's time.
-
-    :param seconds: the seconds of every method, by round
-    :param name: the method
-    :param paper_ratio: the paper's ratio to TD3
-    :return: seconds and ratios; None if the method was not timed
-    """
-    if name not in seconds:
-        return None
-    reference = seconds.get(REFERENCE)
-    return {
-        "seconds": summary(seconds[name]),
-        "ratio": None if reference is None else ratio(seconds[name], reference),
-        "paper_ratio": paper_ratio,
-    }
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -156,7 +21,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     Read the command line.
 
     :param argv: the arguments
-    :return: what they say
+    :return: the parsed arguments
     """
     parser = measuring_parser("runtime", "Measure the paper's run-time table.")
     parser.add_argument("--episodes", type=count, default=10, help="training episodes per method (default: %(default)s)")
@@ -182,21 +47,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     Measure, and write the table.
 
-    :param argv: the command line; None for the process's own
+    :param argv: the command line; None for that of the process
     """
-    argv = sys.argv[1:] if argv is None else argv
-    args = parse(argv)
-    th.set_num_threads(args.threads)
-    if args.threads == 1:
-        # JAX reads this when it is first imported
-        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
-    record = {
-        **conditions("benchmark.runtime", argv, args.device),
-        **{name: getattr(args, name) for name in RECORDED},
-        "burn_in_steps": burn_in_steps(args.episode_steps),
-        "methods": measure(args),
-    }
-    publish(args.folder, "runtime", record, markdown(record))
+    measure_and_publish("runtime", parse, measure, RECORDED, markdown, argv)
 
 
 if __name__ == "__main__":

@@ -1,161 +1,19 @@
 """
-How the cost of training grows: with CEM's settings, the networks, the spaces and the number of parallel environments.
+Measure how the cost of training grows: with CEM's settings, the networks, the spaces and the number of parallel environments.
 
 ``python -m benchmark.scaling`` writes ``scaling.png`` and ``scaling.json``.
 """
 
 import argparse
-import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from collections.abc import Sequence
 
-import torch as th
-from stable_baselines3 import TD3
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
-
-from benchmark.common.arguments import continuous_environment, count, measuring_parser
-from benchmark.common.files import write_json
-from benchmark.common.provenance import conditions
-from benchmark.speed.boxes import BoxEnv
+from benchmark.common.arguments import continuous_environment, count
+from benchmark.common.measuring import measure_and_publish, measuring_parser
 from benchmark.speed.scaling_figure import draw
-from benchmark.speed.timing import interleaved, summary
-from sb3_cgp import CGP
+from benchmark.speed.scaling_points import AXES, measure
 from sb3_cgp.common.files import write_atomically
 
-BATCH_SIZE = 128
-# Random steps before the first gradient step
-WARM_UP = 256
-NO_LOG = 10**9
-AXES: dict[str, tuple[int, ...]] = {
-    "cem_iterations": (1, 2, 4, 8),
-    "cem_samples": (16, 32, 64, 128, 256),
-    "width": (64, 128, 256, 512),
-    "action_dim": (1, 6, 17, 64),
-    "observation_dim": (17, 64, 256, 1024),
-    "n_envs": (1, 2, 4, 8, 16),
-}
-
-
-@dataclass(frozen=True)
-class Setting:
-    """
-    What is measured at one point, by default the paper's settings at HalfCheetah's sizes.
-
-    :param algorithm: "CGP" or "TD3"
-    :param cem_iterations: iterations of CEM
-    :param cem_samples: CEM's samples per state and iteration
-    :param width: units of each of the two hidden layers
-    :param action_dim: action dimensions
-    :param observation_dim: observation dimensions
-    :param n_envs: parallel environments; None for one :class:`~benchmark.speed.boxes.BoxEnv` in place of a real one
-    """
-
-    algorithm: str
-    cem_iterations: int = 2
-    cem_samples: int = 64
-    width: int = 256
-    action_dim: int = 6
-    observation_dim: int = 17
-    n_envs: int | None = None
-
-
-def setting_at(algorithm: str, axis: str, value: int) -> Setting:
-    """
-    Find what to measure at a point of an axis.
-
-    :param algorithm: "CGP" or "TD3"
-    :param axis: what is varied
-    :param value: its value
-    :return: the setting; TD3 has no CEM to vary, and is the same all along its axes
-    """
-    if algorithm == "TD3" and axis.startswith("cem_"):
-        return Setting(algorithm)
-    varied: dict[str, Any] = {axis: value}
-    return replace(Setting(algorithm), **varied)
-
-
-def make_env(setting: Setting, env_id: str, seed: int) -> VecEnv:
-    """
-    Make a setting's environments.
-
-    :param setting: the setting
-    :param env_id: the environment to make several of, where their number is measured
-    :param seed: their seed
-    :return: the environments
-    """
-    if setting.n_envs is not None:
-        return make_vec_env(env_id, setting.n_envs, seed=seed)
-    return make_vec_env(partial(BoxEnv, setting.observation_dim, setting.action_dim), seed=seed)
-
-
-def make_model(setting: Setting, env: VecEnv, seed: int, device: th.device) -> OffPolicyAlgorithm:
-    """
-    Make a setting's model, with enough transitions in its buffer to train on.
-
-    :param setting: the setting
-    :param env: its environments
-    :param seed: seed of its random numbers
-    :param device: where its networks compute
-    :return: the model
-    """
-    common: dict[str, Any] = dict(
-        env=env,
-        buffer_size=WARM_UP * env.num_envs,
-        learning_starts=WARM_UP,
-        batch_size=BATCH_SIZE,
-        train_freq=1,
-        gradient_steps=1,
-        policy_kwargs=dict(net_arch=[setting.width, setting.width]),
-        seed=seed,
-        device=device,
-    )
-    model: OffPolicyAlgorithm
-    if setting.algorithm == "TD3":
-        model = TD3("MlpPolicy", **common)
-    else:
-        model = CGP("MlpPolicy", cem_iterations=setting.cem_iterations, cem_samples=setting.cem_samples, **common)
-    model.learn(WARM_UP + env.num_envs, log_interval=NO_LOG)
-    return model
-
-
-def measure(args: argparse.Namespace) -> list[dict[str, Any]]:
-    """
-    Measure all the points asked for.
-
-    :param args: the command line
-    :return: the points, by axis and value
-    """
-    points = [
-        (axis, value, setting_at(algorithm, axis, value))
-        for axis in args.axes
-        for value in AXES[axis]
-        for algorithm in ("CGP", "TD3")
-    ]
-    steps = args.gradient_steps
-    gradient_runs: dict[Setting, Callable[[], object]] = {}
-    learn_runs: dict[Setting, Callable[[], object]] = {}
-    for setting in dict.fromkeys(setting for _, _, setting in points):
-        env = make_env(setting, args.env, args.seed)
-        model = make_model(setting, env, args.seed, args.device)
-        gradient_runs[setting] = partial(model.train, steps, BATCH_SIZE)
-        if setting.n_envs is not None:
-            learn_runs[setting] = partial(model.learn, steps * setting.n_envs, log_interval=NO_LOG, reset_num_timesteps=False)
-    gradient_seconds = interleaved(gradient_runs, args.rounds, device=args.device, title="gradient steps")
-    learn_seconds = interleaved(learn_runs, args.rounds, device=args.device, title="environment steps")
-
-    measured = []
-    for axis, value, setting in points:
-        point: dict[str, Any] = {"axis": axis, "value": value, "algorithm": setting.algorithm}
-        point["gradient_step_seconds"] = summary([seconds / steps for seconds in gradient_seconds[setting]])
-        if setting.n_envs is not None:
-            speeds = [steps * setting.n_envs / seconds for seconds in learn_seconds[setting]]
-            point["env_steps_per_second"] = summary(speeds)
-        measured.append(point)
-    return measured
+RECORDED = ("env", "seed", "rounds", "gradient_steps")
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -163,7 +21,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     Read the command line.
 
     :param argv: the arguments
-    :return: what they say
+    :return: the parsed arguments
     """
     parser = measuring_parser("scaling", "Measure how the cost of training grows.")
     parser.add_argument("--rounds", type=count, default=10, help="timed runs of each setting (default: %(default)s)")
@@ -175,7 +33,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         default="HalfCheetah-v5",
         help="environment to run several of in parallel (default: %(default)s)",
     )
-    parser.add_argument("--axes", nargs="+", choices=list(AXES), default=list(AXES), help="what to vary (default: all)")
+    parser.add_argument("--axes", nargs="+", choices=list(AXES), default=list(AXES), help="axes to vary (default: all)")
     return parser.parse_args(argv)
 
 
@@ -183,17 +41,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     Measure, and draw the figure.
 
-    :param argv: the command line; None for the process's own
+    :param argv: the command line; None for that of the process
     """
-    argv = sys.argv[1:] if argv is None else argv
-    args = parse(argv)
-    th.set_num_threads(args.threads)
-    record = {
-        **conditions("benchmark.scaling", argv, args.device),
-        **{name: getattr(args, name) for name in ("env", "seed", "rounds", "gradient_steps")},
-        "points": measure(args),
-    }
-    write_json(args.folder / "scaling.json", record)
+    args, record = measure_and_publish("scaling", parse, measure, RECORDED, argv=argv)
     write_atomically(args.folder / "scaling.png", draw(record))
     print(f"{args.folder / 'scaling.png'}\n{args.folder / 'scaling.json'}")
 

@@ -1,85 +1,23 @@
 """
-A process that works off a study: it claims a run, trains it, and claims the next, until all have ended.
+Train the runs of a study: the process claims a run, trains it, and claims the next, until all have ended.
 
-``benchmark.sweep`` starts these; ``python -m benchmark.worker --help`` says how to start one by hand.
+``benchmark.sweep`` starts such processes; ``python -m benchmark.worker --help`` tells how to start one by hand.
 """
 
 import argparse
-import functools
 import os
 import socket
 import sys
-import time
-import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch as th
-from filelock import FileLock
 
 from benchmark.common.arguments import count
-from benchmark.sweeps.heartbeats import BEAT, Heart, TrialLostError
-from benchmark.sweeps.processes import TERMINATED, add_heartbeats, listen, see_that_grace_is_longer
-from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, run_folder, train
+from benchmark.sweeps.processes import add_heartbeats, check_grace, install_signal_handlers
 from benchmark.sweeps.storages import open_storage, patiently
-from benchmark.sweeps.studies import Claim, Ledger
-
-# Seconds between two looks at a study of which no run waits
-PAUSE = 2.0
-
-
-def work(ledger: Ledger, logs: Path, name: str, beat: float = BEAT, parent: int | None = None, device: str = "auto") -> None:
-    """
-    Work a study off.
-
-    :param ledger: the study
-    :param logs: the folder of all sweeps' runs
-    :param name: this process's name, for people
-    :param beat: seconds between two heartbeats
-    :param parent: the process that started this one
-    :param device: where the networks compute
-    :raises SystemExit: if the process is asked to end; its run is given back, to be taken up again
-    """
-    while True:
-        ledger.recover()
-        claim = ledger.claim(name)
-        if claim is not None:
-            _train_claimed(ledger, claim, logs, beat, parent, device)
-        elif not ledger.left():
-            return
-        else:
-            # Others' runs, or those of processes that have not been silent for long enough
-            time.sleep(PAUSE)
-            if parent is not None and os.getppid() != parent:
-                raise SystemExit(TERMINATED)
-
-
-def _train_claimed(ledger: Ledger, claim: Claim, logs: Path, beat: float, parent: int | None, device: str) -> None:
-    folder = run_folder(logs, ledger.name, claim.run)
-    folder.mkdir(parents=True, exist_ok=True)
-    print(f"{time.strftime('%H:%M:%S')} {claim.run.key}", flush=True)
-
-    def report(step: int, value: float) -> None:
-        ledger.report(claim, step, value)
-
-    try:
-        # The lock: another process that was given up, but is not dead, may still be writing there
-        with Heart(functools.partial(ledger.beat, claim), beat, parent) as heart, FileLock(folder / ".lock"):
-            final = train(claim.run, folder, report, heart.watch, device)
-        ledger.complete(claim, final)
-        forget_states(folder)
-    except TrialLostError:
-        print(f"{claim.run.key} was taken over by another process", flush=True)
-    except MACHINE_ERRORS:
-        ledger.release(claim)
-        raise
-    except Exception as error:
-        traceback.print_exc()
-        ledger.fail(claim, error)
-    except BaseException:
-        ledger.release(claim)
-        raise
+from benchmark.sweeps.studies import Ledger
+from benchmark.sweeps.worker_loop import execute_runs
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -87,32 +25,31 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     Read the command line.
 
     :param argv: the arguments
-    :return: what they say
+    :return: the parsed arguments
     """
-    parser = argparse.ArgumentParser(prog="python -m benchmark.worker", description="Work off a study's runs.")
+    parser = argparse.ArgumentParser(prog="python -m benchmark.worker", description="Train the runs of a study.")
     parser.add_argument("--study", required=True, help="the study's name")
     parser.add_argument("--storage", required=True, help="the URL of its storage")
     parser.add_argument("--logs", type=Path, required=True, help="the folder of all sweeps' runs")
     parser.add_argument("--threads", type=count, default=1, help="PyTorch's threads (default: %(default)s)")
-    parser.add_argument("--device", default="auto", help="where the networks compute (default: %(default)s)")
+    parser.add_argument("--device", default="auto", help="device of the networks (default: %(default)s)")
     add_heartbeats(parser)
-    parser.add_argument("--parent", type=int, help="the process after which this one is to end, too")
+    parser.add_argument("--parent", type=int, help="the process whose end is this one's, too")
     return parser.parse_args(argv)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """
-    Work a study off.
+    Train the runs of a study.
 
-    :param argv: the command line; None for the process's own
+    :param argv: the command line; None for that of the process
     """
     args = parse(sys.argv[1:] if argv is None else argv)
-    see_that_grace_is_longer(args.beat, args.grace)
-    listen(args.parent)
+    check_grace(args.beat, args.grace)
+    install_signal_handlers(args.parent)
     th.set_num_threads(args.threads)
-    arguments: dict[str, Any] = dict(beat=args.beat, parent=args.parent, device=args.device)
     ledger = Ledger(patiently(open_storage, args.storage), args.study, args.grace)
-    work(ledger, args.logs, f"{socket.gethostname()}:{os.getpid()}", **arguments)
+    execute_runs(ledger, args.logs, f"{socket.gethostname()}:{os.getpid()}", args.beat, args.parent, args.device)
 
 
 if __name__ == "__main__":

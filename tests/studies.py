@@ -9,10 +9,12 @@ from types import SimpleNamespace
 
 from optuna.trial import TrialState
 
-from benchmark import worker
 from benchmark.sweeps import storages
-from benchmark.sweeps.experiments import Run, Sweep
-from benchmark.sweeps.studies import ERROR, KEY, Ledger, owned
+from benchmark.sweeps import worker_loop as worker
+from benchmark.sweeps.experiments import Sweep
+from benchmark.sweeps.runs import Run
+from benchmark.sweeps.studies import Ledger
+from benchmark.sweeps.study_trials import ERROR, KEY, owned
 from benchmark.sweeps.sweep_files import Method, SweepFile
 
 GRACE = 60.0
@@ -70,7 +72,7 @@ class Heart:
 def pretend(monkeypatch, clock):
     """Let workers train nothing, and wait for nothing."""
     monkeypatch.setattr(worker, "train", pretend_to_train)
-    monkeypatch.setattr(worker, "Heart", Heart)
+    monkeypatch.setattr(worker, "HeartbeatThread", Heart)
     monkeypatch.setattr(worker, "FileLock", lambda path: nullcontext())
     times = SimpleNamespace(sleep=clock.sleep, monotonic=clock, strftime=time.strftime)
     monkeypatch.setattr(worker, "time", times)
@@ -111,7 +113,7 @@ def work_through(storage, sweep, clock, logs):
     """Do what a process of a sweep does."""
     ledger = Ledger(storage, "study", GRACE, clock)
     ledger.open(sweep, {"experiment": sweep.name})
-    worker.work(ledger, logs, "a process")
+    worker.execute_runs(ledger, logs, "a process")
 
 
 def mortal(storage, sweep, clock, logs, calls, takes_effect):

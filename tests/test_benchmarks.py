@@ -5,17 +5,20 @@ import re
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium.utils.env_checker import check_env
 from matplotlib.image import imread
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from tables import unpadded
 from torch import nn
 
-from benchmark import latency, runtime, scaling, selector
+from benchmark import checkpoint, latency, runtime, scaling, selector
 from benchmark.common import arguments
-from benchmark.speed import contenders, products
+from benchmark.speed import cem_calls, checkpoints, contenders, latencies, products, run_times, scaling_points
 from benchmark.speed.boxes import BoxEnv
 from benchmark.speed.plain import PlainPolicy
 from benchmark.speed.products import Sizes
@@ -24,7 +27,7 @@ from sb3_cgp import CGP
 from sb3_cgp.core.policies import repeated_q_score
 
 CPU = th.device("cpu")
-COMMANDS = {"latency": latency, "runtime": runtime, "selector": selector, "scaling": scaling}
+COMMANDS = {"checkpoint": checkpoint, "latency": latency, "runtime": runtime, "selector": selector, "scaling": scaling}
 
 
 def test_turns_rotate_and_the_burn_in_is_not_timed():
@@ -94,7 +97,7 @@ def test_every_kernel_multiplies_by_the_transposed_weights(dtype):
 
 
 def test_sizes_are_varied_one_at_a_time():
-    sizes = selector.sizes_to_measure(["batch", "width"])
+    sizes = cem_calls.sizes_to_measure(["batch", "width"])
     assert sizes[0] == Sizes()
     assert len(set(sizes)) == len(sizes) == 1 + 4 + 4
     assert {(size.batch, size.width) for size in sizes} == {
@@ -193,7 +196,7 @@ def test_without_td3_there_are_no_ratios(tmp_path):
     options = "--env Pendulum-v1 --episode-steps 2 --episodes 1 --inference-episodes 1 --methods DDPG"
     record = run_command("runtime", tmp_path, *options.split())
     assert record["methods"]["DDPG"]["train"]["ratio"] is None
-    assert "| - | 1.01 |" in (tmp_path / "runtime.md").read_text()
+    assert "| - | 1.01 |" in unpadded((tmp_path / "runtime.md").read_text())
 
 
 def test_every_contender_has_the_same_batch_and_network():
@@ -217,11 +220,11 @@ def test_every_contender_has_the_same_batch_and_network():
 
 def test_data_type_goes_to_the_methods_that_score_by_the_fast_way(tmp_path, monkeypatch):
     given = {}
-    monkeypatch.setattr(runtime, "make_agent", lambda name, *args, **kwargs: given.update({name: kwargs}))
+    monkeypatch.setattr(run_times, "make_agent", lambda name, *args, **kwargs: given.update({name: kwargs}))
     methods = ["TD3", "CEM-4", "CGP-2", "CGP-2-plain"]
     options = f"--env Pendulum-v1 --cem-dtype float32 --folder {tmp_path}"
     args = runtime.parse([*options.split(), "--methods", *methods])
-    runtime.make_agents(args)
+    run_times.make_agents(args)
     float32 = {"cem_dtype": "float32"}
     assert given == {"TD3": {}, "CEM-4": float32, "CGP-2": float32, "CGP-2-plain": {}}
 
@@ -234,7 +237,7 @@ def test_inference_acts_deterministically_for_as_many_steps_as_asked():
             asked.append((observation.copy(), deterministic))
             return super().predict(observation, deterministic)
 
-    episode = runtime.inference_episode(Agent(make_vec_env("Pendulum-v1")), "Pendulum-v1", seed=0, steps=4)
+    episode = run_times.inference_episode(Agent(make_vec_env("Pendulum-v1")), "Pendulum-v1", seed=0, steps=4)
     episode()
     episode()
     assert [deterministic for _, deterministic in asked] == [True] * 8
@@ -259,7 +262,7 @@ def test_selector_writes_what_follows_from_the_seconds(tmp_path):
     assert entry["share_of_hidden_products"] == pytest.approx((fastest[0] / call[0] + fastest[1] / call[1]) / 2)
     shares = [(fastest[turn] + outer[turn]) / call[turn] for turn in range(2)]
     assert entry["share_of_products"] == pytest.approx(sum(shares) / 2)
-    row = next(line for line in (tmp_path / "selector.md").read_text().splitlines() if "128 × 64 × 2" in line)
+    row = next(line for line in unpadded((tmp_path / "selector.md").read_text()).splitlines() if "128 × 64 × 2" in line)
     assert f"| {entry['ratio_to_plain']:.2f} |" in row
     assert f"| {entry['share_of_products']:.0%} |" in row
 
@@ -271,7 +274,7 @@ def test_selector_asks_for_the_data_type(tmp_path, monkeypatch):
         asked.add(dtype)
         return repeated_q_score(network, features)
 
-    monkeypatch.setattr(selector, "q_score", score)
+    monkeypatch.setattr(cem_calls, "q_score", score)
     run_command("selector", tmp_path, "--rounds", "1", "--dtypes", "bfloat16", "--vary")
     assert asked == {th.bfloat16}
 
@@ -291,12 +294,15 @@ def test_outer_and_hidden_products_are_all_that_a_call_multiplies(monkeypatch, s
 
 
 def test_scaling_draws_what_it_measures(tmp_path, monkeypatch):
-    monkeypatch.setattr(scaling, "AXES", {"cem_samples": (8, 16), "observation_dim": (3, 5), "n_envs": (1, 2)})
+    monkeypatch.setattr(scaling_points, "AXES", {"cem_samples": (8, 16), "observation_dim": (3, 5), "n_envs": (1, 2)})
     options = "--env Pendulum-v1 --rounds 2 --gradient-steps 2 --axes cem_samples observation_dim n_envs"
     record = run_command("scaling", tmp_path, *options.split())
     points = record["points"]
     assert [(point["axis"], point["value"], point["algorithm"]) for point in points] == [
-        (axis, value, algorithm) for axis, values in scaling.AXES.items() for value in values for algorithm in ("CGP", "TD3")
+        (axis, value, algorithm)
+        for axis, values in scaling_points.AXES.items()
+        for value in values
+        for algorithm in ("CGP", "TD3")
     ]
     for point in points:
         assert len(point["gradient_step_seconds"]["all"]) == 2
@@ -318,10 +324,10 @@ def test_scaling_divides_by_the_steps_that_are_made(tmp_path, monkeypatch):
             assert model.num_timesteps - timesteps in (0, 4 * model.n_envs)
         return {setting: [1.0] * rounds for setting in runs}
 
-    monkeypatch.setattr(scaling, "interleaved", one_second_each)
-    monkeypatch.setattr(scaling, "AXES", {"n_envs": (1, 3)})
+    monkeypatch.setattr(scaling_points, "interleaved", one_second_each)
+    monkeypatch.setattr(scaling_points, "AXES", {"n_envs": (1, 3)})
     options = f"--env Pendulum-v1 --rounds 2 --gradient-steps 4 --axes n_envs --folder {tmp_path}"
-    points = scaling.measure(scaling.parse(options.split()))
+    points = scaling_points.measure(scaling.parse(options.split()))["points"]
     assert {point["gradient_step_seconds"]["median"] for point in points} == {1 / 4}
     assert [point["env_steps_per_second"]["median"] for point in points] == [4.0, 4.0, 12.0, 12.0]
 
@@ -330,8 +336,8 @@ def test_scaling_divides_by_the_steps_that_are_made(tmp_path, monkeypatch):
 def test_scaling_varies_the_model(algorithm):
     varied = {"cem_iterations": 3, "cem_samples": 9, "width": 8, "action_dim": 4, "observation_dim": 11, "n_envs": 2}
     for axis, value in varied.items():
-        setting = scaling.setting_at(algorithm, axis, value)
-        model = scaling.make_model(setting, scaling.make_env(setting, "Pendulum-v1", seed=0), seed=0, device=CPU)
+        setting = scaling_points.setting_at(algorithm, axis, value)
+        model = scaling_points.make_model(setting, scaling_points.make_env(setting, "Pendulum-v1", seed=0), seed=0, device=CPU)
         assert model._n_updates == 1
         inputs = 3 + 1 if axis == "n_envs" else 11 + 6 if axis == "observation_dim" else 17 + 4 if axis == "action_dim" else 23
         first = model.critic.q_networks[0][0]
@@ -353,9 +359,41 @@ def test_latency_is_of_single_actions_that_agree(tmp_path):
     assert "medians of 3\nrounds of 2 actions each" in text
     model = CGP("MlpPolicy", "Pendulum-v1", buffer_size=1, seed=1)
     observation = np.array([0.6, -0.8, 3.0], np.float32)
-    actions = [act(observation) for act in latency.ways_to_act(model, tmp_path / "export", threads=1).values()]
+    actions = [act(observation) for act in latencies.ways_to_act(model, tmp_path / "export", threads=1).values()]
     assert [action.shape for action in actions] == [(1,)] * 3
     assert np.allclose(actions, actions[0], atol=1e-4)
+
+
+def test_a_checkpoint_is_of_a_full_buffer_and_of_all_steps_since_the_last(tmp_path, monkeypatch):
+    steps = []
+    save = checkpoints.StateStore.save
+
+    def counting(self, step, state):
+        steps.append(step)
+        return save(self, step, state)
+
+    monkeypatch.setattr(checkpoints.StateStore, "save", counting)
+    options = "--env Pendulum-v1 --transitions 200 --new 10 --rounds 2 --device cpu"
+    record = run_command("checkpoint", tmp_path, *options.split())
+    assert steps == [0, 10, 20, 30, 40, 50]
+    seconds = record["measured"]["seconds"]
+    assert list(seconds) == ["first", "second", "later", "load"]
+    assert all(len(each["all"]) == 2 and min(each["all"]) > 0.0 for each in seconds.values())
+    # 200 transitions of 3 + 3 + 1 + 1 numbers, at the least
+    assert record["measured"]["bytes"] > 200 * 8 * 4
+    assert "a replay buffer of 200 transitions" in (tmp_path / "checkpoint.md").read_text()
+
+
+def test_a_buffer_is_filled_around_its_end():
+    buffer = ReplayBuffer(10, gym.spaces.Box(-1, 1, (2,)), gym.spaces.Box(-1, 1, (1,)))
+    generator = np.random.default_rng(0)
+    checkpoints.fill(buffer, 7, generator)
+    assert (buffer.pos, buffer.full) == (7, False)
+    before = buffer.rewards.copy()
+    checkpoints.fill(buffer, 5, generator)
+    assert (buffer.pos, buffer.full) == (2, True)
+    changed = (buffer.rewards != before).ravel()
+    assert changed.tolist() == [True] * 2 + [False] * 5 + [True] * 3
 
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space:UserWarning")

@@ -9,8 +9,9 @@ import pytest
 from finished_studies import record, runs, write_study
 
 from benchmark.common.records import Record
-from benchmark.reporting.claims import CONTRADICTED, NO_DATA, NOT_DECIDED, SUPPORTED, Finding, findings
+from benchmark.reporting.claims import findings
 from benchmark.reporting.scores import read_study, score_table
+from benchmark.reporting.verdicts import CONTRADICTED, NO_DATA, NOT_DECIDED, SUPPORTED, Finding
 
 SWEPT = [{"width": 32}, {"width": 64}]
 VARIANTS = ["CGP-Online", "CGP-Offline", "QGP-Online", "QGP-Offline"]

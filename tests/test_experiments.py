@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from benchmark.sweeps.experiments import included_sweeps, load_sweep, sweeps_folder
-from benchmark.sweeps.sweep_files import SweepError
+from benchmark.sweeps.validation import SweepError
 
 GOOD = dict(title="A sweep", methods=["TD3", "CGP-Online"], tasks=["Pendulum-v1"], steps=100, seeds=2, evaluation_interval=10)
 PAPER = ["e1", "e3", "e4", "e5", "e6", "e7", "e8"]
@@ -176,6 +176,16 @@ def test_a_subset_of_seeds_and_a_checkpoint_interval(sweep_of):
         (dict(exclude=[{"gamma": 1}]), "gamma", "must name one of"),
         (dict(axes={"gamma": {"values": [0.5]}}, exclude=[{"gamma": 1}]), "gamma", "must have one of [0.5]"),
         (dict(hyperparams={"learning_rte": 1}), "learning_rte", "learning_rate"),
+        (dict(axes={"learning_rate": {"values": ["1e-3"]}}), "learning_rate", "'1e-3' of TD3 (td3) is text in YAML"),
+        (dict(axes={"learning_rate": {"values": ["1e-5"]}}), "learning_rate", "must be a number: write 1.0e-05"),
+        (dict(hyperparams={"tau": "0.01"}), "tau", "'0.01' of TD3 (td3) is text in YAML"),
+        (dict(hyperparams={"policy_kwargs": {"net_arch": [64, "64"]}}), "policy_kwargs", "'64' of TD3 (td3) is text in YAML"),
+        (dict(axes={"a": {"values": {"low": {"gamma": "9e-1"}}}}), "gamma", "'9e-1' of TD3 (td3) is text in YAML"),
+        (
+            dict(methods={"A": {"algo": "sac", "hyperparams": {"gamma": "high"}}}),
+            "gamma",
+            "'high' of A (sac) must be a number",
+        ),
         (dict(axes={"cem_samples": {"values": [8]}}), "cem_samples", "of TD3"),
     ],
 )
@@ -183,6 +193,11 @@ def test_a_mistake_is_named_with_what_is_allowed(tmp_path, sweep_of, changes, ke
     with pytest.raises(SweepError) as error:
         sweep_of(**changes)
     assert all(part in str(error.value) for part in (str(tmp_path / "mine.yml"), key, allowed)), str(error.value)
+
+
+def test_text_that_looks_like_a_number_is_left_to_other_code(sweep_of):
+    sweep = sweep_of(hyperparams={"env_kwargs": {"version": "2"}, "env_wrapper": [{"my.Wrapper": {"name": "1e3"}}]}, seeds=1)
+    assert all(run.hyperparams["env_kwargs"] == {"version": "2"} for run in sweep.runs())
 
 
 def test_no_sweep_of_that_name():

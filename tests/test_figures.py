@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from finished_studies import SWEEP, record, runs, write_study
 from matplotlib.image import imread
+from tables import unpadded
 
-from benchmark import figures as command
 from benchmark.common.style import FURTHER, METHODS, styles
-from benchmark.figures import figures, main, study_folders
+from benchmark.figures import main
+from benchmark.reporting import figures as command
 from benchmark.reporting.drawing import stability
+from benchmark.reporting.figures import figures, study_folders
 from benchmark.reporting.page import reward_tables
 from benchmark.reporting.scores import curves, evaluation_grid, read_study, score_table
 
@@ -42,6 +44,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_study(folder / "variants", runs(score, ["CGP-Online", "CGP-Offline"], GRID[:2]))
     figures(study_folders(folder), folder, repetitions=100)
     return folder
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write empty files in place of pictures, for tests of what the page says."""
+    for name in ("learning_curves", "final_rewards", "stability", "sensitivity", "values"):
+        monkeypatch.setattr(command, name, lambda *args: b"")
 
 
 def test_figures_follow_from_the_runs(folder: Path) -> None:
@@ -79,13 +88,14 @@ def test_page_shows_every_figure_with_its_command(folder: Path, tmp_path: Path) 
     assert not (tmp_path / "results.md").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_page_repeats(folder: Path, tmp_path: Path) -> None:
     again = figures(study_folders(folder), tmp_path, repetitions=100).read_text()
     assert again.replace(str(tmp_path), str(folder)) == (folder / "results.md").read_text()
 
 
 def test_page_names_sweeps_runs_and_failures(folder: Path) -> None:
-    text = (folder / "results.md").read_text()
+    text = unpadded((folder / "results.md").read_text())
     assert f"`python -m {SWEEP} axis`" in text
     assert "24 of 30 planned runs have ended, 1 of them failed. **The rest is missing" in text
     assert "- TD3: `ValueError: NaN` (1 run)" in text
@@ -98,14 +108,15 @@ def test_page_names_sweeps_runs_and_failures(folder: Path) -> None:
 
 
 def test_probability_of_improvement_is_sure_where_it_is(folder: Path) -> None:
-    text = (folder / "results.md").read_text()
+    text = unpadded((folder / "results.md").read_text())
     assert "| My-PPO | 1.00 (1.00 to 1.00) | 1.00 (1.00 to 1.00) | 1.00 (1.00 to 1.00) |" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_single_seed_and_a_study_without_runs(tmp_path: Path) -> None:
     single = write_study(tmp_path / "single", runs(score, BASELINES, GRID[:2], seeds=[0]))
     empty = write_study(tmp_path / "empty", [], planned=8)
-    text = figures([single, empty], tmp_path, repetitions=50).read_text()
+    text = unpadded(figures([single, empty], tmp_path, repetitions=50).read_text())
     assert "-150 (no interval)" in text.replace("-150.0", "-150")
     assert "0 of 8 planned runs have ended" in text
     assert "**supported**" not in text.replace("inference cost is independent of the CEM iterations | **supported**", "")
@@ -119,10 +130,15 @@ def test_a_method_whose_runs_all_failed_before_an_evaluation(tmp_path: Path) -> 
     study = read_study(write_study(tmp_path / "beside", records + runs(score, ["TD3"], seeds=range(2))))
     grid = evaluation_grid(study.records, "Pendulum-v1")
     assert curves(records, -7.0, grid).tolist() == [[-7.0] * 4] * 2
-    assert "| Pendulum-v1 | PPO |" in figures([study.folder], tmp_path, repetitions=20).read_text()
+    assert "| Pendulum-v1 | PPO |" in unpadded(figures([study.folder], tmp_path, repetitions=20).read_text())
 
 
-def test_what_was_tried_in_small_leaves_claims_as_they_are(tmp_path: Path, folder: Path) -> None:
+def test_what_was_tried_in_small_leaves_claims_as_they_are(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The figures of a single study do not depend on others
+    monkeypatch.setattr(command, "draw", lambda *args: [])
+
     def claims_and_stability(*studies: str) -> tuple[str, bytes]:
         out = tmp_path / "-".join(studies)
         text = figures([tmp_path / study for study in studies], out, repetitions=50).read_text()
@@ -160,7 +176,7 @@ def test_methods_that_lack_an_axis(tmp_path: Path) -> None:
         *runs(score, ["SAC"], [{"batch_size": 32}]),
         record("PPO", 0, None, returns=[]),
     ]
-    text = figures([write_study(tmp_path / "sweep", records)], tmp_path, repetitions=20).read_text()
+    text = unpadded(figures([write_study(tmp_path / "sweep", records)], tmp_path, repetitions=20).read_text())
     assert "| Pendulum-v1 | batch size 32 | SAC |" in text
 
 
@@ -192,6 +208,7 @@ def test_mistakes_are_named(folder: Path, tmp_path: Path, capsys: pytest.Capture
     assert "'0' is not an integer >= 1" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_all_studies_of_a_folder(folder: Path, tmp_path: Path) -> None:
     for study in ("axis", "axes"):
         shutil.copytree(folder / study, tmp_path / study)

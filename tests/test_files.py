@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmark.common.files import markdown_table
+from benchmark.common.tables import markdown_table
 from sb3_cgp import CGP
 from sb3_cgp.common.files import write_atomically
 
 
 def test_markdown_table_lines_up():
-    assert markdown_table(["a", "b"], [["1", "2"], ["3", "4"]]) == "| a | b |\n| --- | ---: |\n| 1 | 2 |\n| 3 | 4 |"
+    assert markdown_table(["a", "b"], [["1", "2"], ["3", "4"]]) == "|  a  |  b  |\n| --- | --: |\n| 1   |   2 |\n| 3   |   4 |"
 
 
 @pytest.mark.parametrize("name", ["save", "save_replay_buffer"])

@@ -5,8 +5,10 @@ import json
 import numpy as np
 import pytest
 import torch as th
+from tables import unpadded
 
 from benchmark import precision
+from benchmark.speed import elites, precision_runs, precision_tables
 from sb3_cgp import CEM
 
 COMMON = {"env": "Pendulum-v1", "steps": 10}
@@ -25,23 +27,23 @@ def test_overlap_is_the_share_of_common_elites_along_the_first_search():
         values = actions[:, :, 0]
         return th.stack([values[0], -values[1], -(values[2] - values[2].median()).abs()])
 
-    overlaps = precision.elite_overlaps(CEM(2, samples=10, elites=4), exact, rounded, n_states=3, action_dim=1)
+    overlaps = elites.elite_overlaps(CEM(2, samples=10, elites=4), exact, rounded, n_states=3, action_dim=1)
     # Of ten, the four about the fifth are, as elites, the fourth of the largest or none of them
     assert [round(12 * share, 5) in (4.0, 5.0) for share in overlaps] == [True, True]
-    assert precision.elite_overlaps(CEM(3, 10, 10), exact, rounded, n_states=3, action_dim=1) == [1.0, 1.0, 1.0]
+    assert elites.elite_overlaps(CEM(3, 10, 10), exact, rounded, n_states=3, action_dim=1) == [1.0, 1.0, 1.0]
     # It narrows around what the first one likes
     assert seen[1].mean() > seen[0].mean() + 0.3
 
 
 def test_statistics_of_two_sets_of_rewards():
-    found = precision.compare([1.0, 2.0, 3.0, 4.0], [2.0, 3.0, 4.0, 5.0])
+    found = precision_tables.compare([1.0, 2.0, 3.0, 4.0], [2.0, 3.0, 4.0, 5.0])
     assert found["difference"] == 1.0
     # Equal variances of 5/3: a standard error of sqrt(5/6), 6 degrees of freedom
     half_width = 2.446912 * np.sqrt(5 / 6)
     assert found["interval"] == pytest.approx((1.0 - half_width, 1.0 + half_width), rel=1e-5)
     assert 0.0 < found["welch_p"] < 1.0
     # All of one below all of the other: 2 of the 70 ways to share out the ranks are as extreme
-    assert precision.compare([1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0])["mann_whitney_p"] == pytest.approx(2 / 70)
+    assert precision_tables.compare([1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0])["mann_whitney_p"] == pytest.approx(2 / 70)
 
 
 def test_table_says_what_the_records_say():
@@ -51,10 +53,10 @@ def test_table_says_what_the_records_say():
     overlaps = [{"critic": [0.99, 0.9]}, {"critic": [0.97, 0.98]}]
     records = [record("float32", seed, [10.0 * seed, 20.0], overlaps=overlaps[seed]) for seed in range(2)]
     records += [record("bfloat16", seed, [100.0, 120.0 + seed]) for seed in range(2)]
-    text = precision.markdown(records)
+    text = unpadded(precision_tables.markdown(records))
     assert "| Pendulum-v1 | 0, 1 | 10 | 12.5 ± 3.5 | 110.2 ± 0.4 | 97.8 (" in text
     assert "| Pendulum-v1 | critic | 98.0% (97.0%) | 94.0% (90.0%) |" in text
-    assert "| Pendulum-v1 | 0 / 1 | 10 | - | - | - | - |" in precision.markdown([records[0], records[3]])
+    assert "| Pendulum-v1 | 0 / 1 | 10 | - | - | - | - |" in unpadded(precision_tables.markdown([records[0], records[3]]))
 
 
 def test_runs_are_recorded_as_they_end_and_not_repeated(tmp_path, monkeypatch):
@@ -66,22 +68,24 @@ def test_runs_are_recorded_as_they_end_and_not_repeated(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return COMMON | {"dtype": dtype, "seed": seed, "returns": [1.0]}
 
-    monkeypatch.setattr(precision, "run", run)
+    monkeypatch.setattr(precision_runs, "run", run)
     options = ["--folder", str(tmp_path), "--envs", "Pendulum-v1", "--seeds", "5", "6"]
     with pytest.raises(KeyboardInterrupt):
         precision.main(options)
     assert len(list(tmp_path.glob("*.json"))) == 2
     precision.main(options)
     assert asked == [("float32", 5), ("bfloat16", 5), ("float32", 6), ("float32", 6), ("bfloat16", 6)]
-    assert "| 5, 6 |" in (tmp_path / "precision.md").read_text()
+    assert "| 5, 6 |" in unpadded((tmp_path / "precision.md").read_text())
 
 
 def test_a_run_trains_with_its_data_type_and_compares_elites(tmp_path, monkeypatch):
-    monkeypatch.setattr(precision, "STATES", 50)
-    monkeypatch.setattr(precision, "EPISODES", 2)
+    monkeypatch.setattr(elites, "STATES", 50)
+    monkeypatch.setattr(precision_runs, "EPISODES", 2)
     options = ["--folder", str(tmp_path), "--envs", "Pendulum-v1", "--seeds", "3", "--steps", "10001"]
     precision.main(options)
-    exact, rounded = (json.loads((tmp_path / f"Pendulum-v1_{dtype}_seed3.json").read_text()) for dtype in precision.DTYPES)
+    exact, rounded = (
+        json.loads((tmp_path / f"Pendulum-v1_{dtype}_seed3.json").read_text()) for dtype in precision_runs.DTYPES
+    )
     assert (exact["steps"], exact["seed"], len(exact["returns"])) == (10_001, 3, 2)
     assert set(exact["overlaps"]) == {"critic", "target critic"}
     # Elites at random would share 6 of 64: a critic of one gradient step is nearly flat

@@ -16,6 +16,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from benchmark import report
+from benchmark.reporting import run_curves, zoo_runs
 from sb3_cgp import CGP
 
 ENV = "Pendulum-v1"
@@ -105,18 +106,18 @@ def test_curve_without_evaluations_is_that_of_the_training_episodes(logs: Path) 
 
 
 def test_many_training_episodes_are_joined_into_few_points(tmp_path: Path) -> None:
-    episodes = report.TRAINING_POINTS * 3
+    episodes = run_curves.TRAINING_POINTS * 3
     lines = ['#{"t_start": 0.0, "env_id": "None"}', "r,l,t", *(f"{number},10,{number}" for number in range(episodes))]
     (tmp_path / "0.monitor.csv").write_text("\n".join(lines))
-    curve = report.read_curve(tmp_path)
+    curve = run_curves.read_curve(tmp_path)
     assert curve.timesteps == list(range(30, episodes * 10 + 1, 30))
     assert curve.mean == list(range(1, episodes, 3))
-    assert curve.std == pytest.approx([np.std([0, 1, 2])] * report.TRAINING_POINTS)
+    assert curve.std == pytest.approx([np.std([0, 1, 2])] * run_curves.TRAINING_POINTS)
 
 
 def test_nothing_recorded_is_an_empty_curve(tmp_path: Path) -> None:
-    assert report.read_curve(tmp_path) == report.Curve("training episodes", [], [], [])
-    assert report.training_seconds(tmp_path) is None
+    assert run_curves.read_curve(tmp_path) == run_curves.Curve("training episodes", [], [], [])
+    assert run_curves.training_seconds(tmp_path) is None
 
 
 def test_picture_is_a_png_of_the_run(logs: Path) -> None:
@@ -140,11 +141,11 @@ def test_summary_says_how_it_ended_and_where_everything_lies(logs: Path, capsys:
 
 
 def test_latest_run_is_the_default(logs: Path) -> None:
-    assert report.find_run(str(logs), "td3", ENV).folder == logs / "td3" / f"{ENV}_2"
+    assert zoo_runs.find_run(str(logs), "td3", ENV).folder == logs / "td3" / f"{ENV}_2"
 
 
 def test_a_run_is_found_by_its_folder_too(logs: Path) -> None:
-    assert report.run_in(logs / "td3" / f"{ENV}_1") == report.find_run(str(logs), "td3", ENV, 1)
+    assert zoo_runs.run_in(logs / "td3" / f"{ENV}_1") == zoo_runs.find_run(str(logs), "td3", ENV, 1)
 
 
 def test_a_folder_without_a_run_or_a_model_is_refused(tmp_path: Path) -> None:

@@ -16,12 +16,14 @@ from optuna.storages import InMemoryStorage, RDBStorage
 from optuna.trial import TrialState
 from studies import GRACE, Clock, Crew, assert_each_run_once, make_sweep, mortal, pretend, pretend_to_train, work_through
 
-from benchmark import worker
+import benchmark.worker
+from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.heartbeats import PROGRESS, TrialLostError
 from benchmark.sweeps.storages import open_storage, patiently
-from benchmark.sweeps.studies import ERROR, KEY, OUTCOME, Ledger
-from benchmark.sweeps.sweep_files import SweepError
-from benchmark.worker import work
+from benchmark.sweeps.studies import Ledger
+from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME, WORKER
+from benchmark.sweeps.validation import SweepError
+from benchmark.sweeps.worker_loop import execute_runs
 
 
 @pytest.fixture
@@ -313,6 +315,12 @@ def test_no_patience_with_other_errors(clock):
         ("grpc://localhost", "must have a host and a port"),
         ("studies.db", "must be a database's URL"),
         ("nosuchdatabase://localhost/x", "must be a database's URL"),
+        ("sqlite://", "in the memory of one process, but must be one that other processes reach, such as sqlite:///"),
+        ("sqlite:///", "in the memory of one process"),
+        ("sqlite:///:memory:", "in the memory of one process"),
+        ("sqlite+pysqlite:///:memory:", "in the memory of one process"),
+        ("sqlite:///file::memory:?cache=shared&uri=true", "in the memory of one process"),
+        ("sqlite:///file:mine?mode=memory&uri=true", "in the memory of one process"),
     ],
 )
 def test_a_storage_that_is_none(url, message):
@@ -330,7 +338,7 @@ def test_what_the_machine_lacks_is_no_fault_of_the_run(ledger, monkeypatch, tmp_
 
     monkeypatch.setattr(worker, "train", train)
     with pytest.raises(type(error)):
-        work(ledger, tmp_path, "a process")
+        execute_runs(ledger, tmp_path, "a process")
     assert ledger.records() == []
     assert len(ledger.left()) == 3
 
@@ -373,7 +381,7 @@ def test_by_way_of_optunas_proxy(monkeypatch, tmp_path):
         storage = open_storage(f"grpc://127.0.0.1:{port}")
         ledger = Ledger(storage, "study", GRACE)
         ledger.open(sweep, {"experiment": sweep.name})
-        work(ledger, tmp_path, "a process")
+        execute_runs(ledger, tmp_path, "a process")
         assert len(servers) == 2
         assert_each_run_once(ledger.trials(), sweep)
         assert len(ledger.records()) == 6
@@ -382,3 +390,19 @@ def test_by_way_of_optunas_proxy(monkeypatch, tmp_path):
         for server in servers:
             server.send_signal(signal.SIGKILL)
             server.wait()
+
+
+def test_the_workers_command_trains_all_runs_of_a_study(tmp_path, monkeypatch):
+    url = f"sqlite:///{tmp_path}/studies.db"
+    ledger = Ledger(open_storage(url), "study", GRACE)
+    sweep = make_sweep()
+    ledger.open(sweep, {"experiment": sweep.name})
+    handled = []
+    monkeypatch.setattr("signal.signal", lambda number, handler: handled.append(number))
+    monkeypatch.setattr(worker, "train", pretend_to_train)
+    benchmark.worker.main(["--study", "study", "--storage", url, "--logs", str(tmp_path), "--device", "cpu"])
+    assert handled == [signal.SIGTERM, signal.SIGINT]
+    assert_each_run_once(ledger.trials(), sweep)
+    assert {trial.user_attrs[WORKER] for trial in ledger.trials()} == {f"{socket.gethostname()}:{os.getpid()}"}
+    with pytest.raises(ValueError, match="must be more than two heartbeats"):
+        benchmark.worker.main(["--study", "study", "--storage", url, "--logs", str(tmp_path), "--grace", "1"])

@@ -3,16 +3,21 @@
 import json
 
 import pytest
+import yaml
 from optuna.trial import TrialState, create_trial
 
 from benchmark.common.records import Record, read_records, write_records
-from benchmark.sweep import describe, hyperparameter, load, main, parse, study_name
-from benchmark.sweeps.experiments import load_sweep
+from benchmark.sweep import hyperparameter, load, main, parse
+from benchmark.sweeps.checks import check_values
+from benchmark.sweeps.execution import describe
+from benchmark.sweeps.experiments import load_sweep, study_name
 from benchmark.sweeps.exports import ended_runs, export_study
-from benchmark.sweeps.progress import Tally
+from benchmark.sweeps.heartbeats import PROGRESS
+from benchmark.sweeps.progress import ProgressTracker
 from benchmark.sweeps.storages import open_storage
-from benchmark.sweeps.studies import ERROR, KEY, PROGRESS, Ledger
-from benchmark.sweeps.sweep_files import SweepError
+from benchmark.sweeps.studies import Ledger
+from benchmark.sweeps.study_trials import ERROR, KEY
+from benchmark.sweeps.validation import SweepError
 
 SMALL = ["e8", "--task", "Pendulum-v1", "--steps", "400", "--seeds", "1", "--methods", "TD3"]
 
@@ -34,7 +39,7 @@ def test_options_replace_what_the_file_says(tmp_path):
     for run in runs:
         assert (run.hyperparams["gamma"], run.hyperparams["learning_rate"]) == (0.9, 0.01)
         assert run.hyperparams["policy_kwargs"] == "dict(net_arch=[8, 8])"
-    assert study_name(sweep, args) == "e8-Pendulum-v1"
+    assert study_name(sweep.name, args.study, args.task) == "e8-Pendulum-v1"
 
 
 @pytest.mark.parametrize(
@@ -42,6 +47,67 @@ def test_options_replace_what_the_file_says(tmp_path):
 )
 def test_a_hyperparameter_is_read_as_yaml_files_are(text, value):
     assert hyperparameter(text) == ("a", value)
+
+
+def write_sweep(folder, **changes):
+    """A sweep of a method of one's own."""
+    content = dict(title="A sweep", tasks=["Pendulum-v1"], steps=100, seeds=1, evaluation_interval=50) | changes
+    path = folder / "mine.yml"
+    path.write_text(yaml.safe_dump(content))
+    return str(path)
+
+
+def method(algo, **hyperparams):
+    return {"M": {"algo": algo, "hyperparams": {"policy": "MlpPolicy"} | hyperparams}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (dict(methods=method("cgp", tau=3)), ["M on Pendulum-v1", "`tau`"]),
+        # Each value is right, but not all combinations are
+        (
+            dict(
+                methods=method("cgp"),
+                axes={"cem_samples": {"values": [8, 64]}, "cem_elites": {"values": [6, 20]}},
+            ),
+            ["M,cem_elites=20,cem_samples=8 on Pendulum-v1", "`cem_elites`"],
+        ),
+        (dict(methods=method("td3", policy="MlpPolcy")), ["M on Pendulum-v1", "MlpPolcy"]),
+        (dict(methods=method("td3", policy_kwargs="dict(net_arch=[8, '8'])")), ["M on Pendulum-v1", "TypeError"]),
+        (dict(methods=method("sac", policy_kwargs="dict(net_arch=[8")), ["M on Pendulum-v1", "SyntaxError"]),
+        (dict(methods=method("td3", learning_rate="linear")), ["M on Pendulum-v1", "ValueError"]),
+        (dict(methods=method("td3", noise_type="loud", noise_std=0.1)), ["M on Pendulum-v1", "loud"]),
+        (dict(methods=method("td3", train_freq=[1, "stepp"])), ["M on Pendulum-v1", "stepp"]),
+        (dict(methods=method("td3", buffer_size=10.5)), ["M on Pendulum-v1", "TypeError"]),
+        (dict(methods=method("ppo", n_steps=1)), ["M on Pendulum-v1", "n_steps"]),
+        (dict(methods=method("td3"), tasks=["Pendulum-v1", "CartPole-v1"]), ["M on CartPole-v1", "Box"]),
+        (dict(methods=method("td3", env_wrapper="no.Wrapper")), ["M on Pendulum-v1", "ModuleNotFoundError"]),
+    ],
+)
+def test_values_are_checked_before_any_run_starts(tmp_path, monkeypatch, changes, words):
+    """... and before the study is made, so that the mended file needs no other name."""
+    monkeypatch.setattr("benchmark.sweeps.execution.start_workers", lambda *args: pytest.fail("it trains"))
+    places = ["--results", str(tmp_path / "results"), "--storage", f"sqlite:///{tmp_path}/studies.db"]
+    with pytest.raises(SystemExit) as error:
+        main([write_sweep(tmp_path, **changes), *places])
+    assert all(word in str(error.value) for word in ["mine.yml", "no model can be made", *words]), str(error.value)
+    assert open_storage(f"sqlite:///{tmp_path}/studies.db").get_all_studies() == []
+
+
+@pytest.mark.parametrize("name", ["e1", "e3", "e4", "e5", "e6", "e7", "e8"])
+def test_the_papers_sweeps_have_values_that_their_methods_take(name):
+    check_values(load_sweep(name, {"tasks": ["Pendulum-v1"]}))
+
+
+def test_checked_values_need_neither_memory_nor_files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sizes = []
+    monkeypatch.setattr("stable_baselines3.TD3._setup_model", lambda self: sizes.append(self.buffer_size))
+    for changes in (method("td3", buffer_size=10**12), method("td3"), method("td3", buffer_size=50)):
+        check_values(load_sweep(write_sweep(tmp_path, methods=changes)))
+    assert sizes == [10_000, 10_000, 50]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.yml"]
 
 
 def test_mistakes_end_the_command_with_what_is_allowed(tmp_path):
@@ -59,6 +125,9 @@ def test_mistakes_end_the_command_with_what_is_allowed(tmp_path):
         (["e2", "--study", "mine"], "is 5 sweeps"),
         (["e3", "--storage", "nonsense"], "storage"),
         (["e3", "--storage", "grpc://localhost"], "port"),
+        (["e3", "--storage", "sqlite://"], "in the memory of one process"),
+        (["e3", "--study", "my/study"], "must be the name of a folder"),
+        (["e3", "--gym-packages", "no_such_package"], "no_such_package"),
     ]:
         with pytest.raises(SystemExit) as error:
             main([argv[0], *common, *argv[1:]])
@@ -140,7 +209,7 @@ def test_exported_runs_are_not_overwritten_by_fewer(tmp_path, ledger, monkeypatc
     end_both(ledger)
     folder = export_study("mine", f"sqlite:///{tmp_path}/studies.db", tmp_path / "results")
     before = (folder / "runs.jsonl").read_bytes()
-    monkeypatch.setattr("benchmark.sweep.start_workers", lambda *args: pytest.fail("it trains"))
+    monkeypatch.setattr("benchmark.sweeps.execution.start_workers", lambda *args: pytest.fail("it trains"))
     places = ["--results", str(tmp_path / "results"), "--storage", f"sqlite:///{tmp_path}/new.db", "--study", "mine"]
     with pytest.raises(SystemExit, match="has 2 ended runs that the study lacks, such as TD3,train_every=episode"):
         main([*SMALL, *places, *options])
@@ -200,34 +269,34 @@ def trial_of(key, state, step=0, **attributes):
 
 
 def test_progress_counts_runs_and_measures_the_speed():
-    tally = Tally(steps=100)
+    tally = ProgressTracker(steps=100)
     waiting, done = trial_of("c", TrialState.WAITING), trial_of("a", TrialState.COMPLETE, 100)
     failed = trial_of("d", TrialState.FAIL, 30, **{ERROR: "NaN"})
     lost = trial_of("b", TrialState.FAIL, 80)
-    first = tally.look([lost, trial_of("b", TrialState.RUNNING, 20), waiting, done, failed], now=0.0)
+    first = tally.add([lost, trial_of("b", TrialState.RUNNING, 20), waiting, done, failed], now=0.0)
     assert (first.runs, first.done, first.running, first.failed) == (4, 1, 1, 1)
     assert first.share == pytest.approx((100 + 100 + 20) / 400)
     assert first.speed is None
-    second = tally.look([trial_of("b", TrialState.RUNNING, 60), waiting, done, failed], now=10.0)
+    second = tally.add([trial_of("b", TrialState.RUNNING, 60), waiting, done, failed], now=10.0)
     assert second.speed == pytest.approx(4.0)
     assert second.seconds_left == pytest.approx((400 - 260) / 4)
     assert "1 of 4 runs done, 1 running, 1 failed, 4 steps/s, 0:00:35 left" in str(second)
 
 
 def test_the_time_left_counts_the_time_in_which_no_environment_moves():
-    tally, waiting = Tally(steps=100), trial_of("b", TrialState.WAITING)
-    tally.look([trial_of("a", TrialState.RUNNING, 0), waiting], now=0.0)
-    tally.look([trial_of("a", TrialState.RUNNING, 100), waiting], now=50.0)
+    tally, waiting = ProgressTracker(steps=100), trial_of("b", TrialState.WAITING)
+    tally.add([trial_of("a", TrialState.RUNNING, 0), waiting], now=0.0)
+    tally.add([trial_of("a", TrialState.RUNNING, 100), waiting], now=50.0)
     # Its policy is trained offline
-    standing = tally.look([trial_of("a", TrialState.RUNNING, 100), waiting], now=200.0)
+    standing = tally.add([trial_of("a", TrialState.RUNNING, 100), waiting], now=200.0)
     assert standing.speed is None
     assert standing.seconds_left == pytest.approx(200.0)
 
 
 def test_the_time_left_forgets_what_is_long_past():
-    tally, runs = Tally(steps=1000), [trial_of("b", TrialState.WAITING)]
+    tally, runs = ProgressTracker(steps=1000), [trial_of("b", TrialState.WAITING)]
     steps_by = {0.0: 0, 4000.0: 10, 7600.0: 910}
-    standings = [tally.look([trial_of("a", TrialState.RUNNING, step), *runs], now) for now, step in steps_by.items()]
+    standings = [tally.add([trial_of("a", TrialState.RUNNING, step), *runs], now) for now, step in steps_by.items()]
     assert standings[-1].seconds_left == pytest.approx((2000 - 910) / (900 / 3600))
 
 

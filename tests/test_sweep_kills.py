@@ -21,10 +21,12 @@ from postgres import Server
 
 from benchmark import worker
 from benchmark.common.records import read_records
+from benchmark.sweeps import worker_loop
 from benchmark.sweeps.experiments import load_sweep
 from benchmark.sweeps.exports import export_study
 from benchmark.sweeps.storages import open_storage
-from benchmark.sweeps.studies import KEY, Ledger
+from benchmark.sweeps.studies import Ledger
+from benchmark.sweeps.study_trials import KEY
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 BEAT, GRACE = 0.3, 2.0
@@ -92,7 +94,7 @@ class Study:
     def _work(self):
         sys.stdout = sys.stderr = open(self.folder / "workers.log", "a")  # noqa: SIM115
         command = ["--study", self.name, "--storage", self.url, "--logs", str(self.folder / "logs"), "--device", "cpu"]
-        worker.PAUSE = 0.2
+        worker_loop.PAUSE = 0.2
         worker.main([*command, "--beat", str(BEAT), "--grace", str(GRACE)])
 
     def man(self, n_workers):
@@ -289,7 +291,7 @@ def test_a_sweeps_command_is_killed_interrupted_and_goes_on(tmp_path):
         assert psutil.wait_procs(workers, timeout=10)[1] == []
         # What was not finished was given back at once, and nothing waits for the grace
         assert TrialState.RUNNING not in [trial.state for trial in trials_of(url, "tiny")]
-        assert "The same command goes on." in (tmp_path / "home" / "output.log").read_text()
+        assert "The same command continues." in (tmp_path / "home" / "output.log").read_text()
     with started(command, tmp_path / "home") as process:
         assert process.wait(timeout=PATIENCE) == 0, (tmp_path / "home" / "output.log").read_text()[-3000:]
     trials = trials_of(url, "tiny")

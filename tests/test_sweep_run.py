@@ -8,7 +8,8 @@ from rl_zoo3.utils import get_saved_hyperparams
 from stable_baselines3 import TD3
 from stable_baselines3.common.env_util import make_vec_env
 
-from benchmark.report import read_curve, run_in
+from benchmark.reporting.run_curves import read_curve
+from benchmark.reporting.zoo_runs import run_in
 from benchmark.sweeps.experiments import load_sweep
 from benchmark.sweeps.random_actions import RandomActions
 from benchmark.sweeps.run import forget_states, run_folder, train

@@ -22,11 +22,13 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from torch import nn
 
 from benchmark import tune
-from benchmark.sweeps import tuning
+from benchmark.sweeps import tune_execution, tuner
 from benchmark.sweeps.entries import base_entry, sampled_entry, write_entry
-from benchmark.sweeps.studies import ERROR
-from benchmark.sweeps.sweep_files import SweepError
-from benchmark.sweeps.tuning import ORIGIN, SCORES, SCORING, Tuner, best_of
+from benchmark.sweeps.scoring import SCORING
+from benchmark.sweeps.study_trials import ERROR
+from benchmark.sweeps.tuner import Tuner, best_of
+from benchmark.sweeps.tuning import ORIGIN, SCORES
+from benchmark.sweeps.validation import SweepError
 from sb3_cgp.zoo.registration import register
 
 register()
@@ -53,9 +55,9 @@ def work(tmp_path, monkeypatch):
     def act(*argv, storage=None, grace=60.0, **options):
         storage = storage or InMemoryStorage()
         args = tune.parse(arguments(*argv, "--logs", str(tmp_path), "--parent", str(os.getppid()), **options))
-        tuner = tuner_of(args, storage, grace)
-        tune.work(tuner, args)
-        return tuner.trials()
+        own = tuner_of(args, storage, grace)
+        tune_execution.execute_trials(own, args)
+        return own.trials()
 
     return act
 
@@ -70,7 +72,7 @@ def pretend(monkeypatch):
             runs.append((run.method, run.seed))
             return score(run)
 
-        monkeypatch.setattr(tuning, "train", train)
+        monkeypatch.setattr(tuner, "train", train)
         return runs
 
     return act
@@ -227,7 +229,7 @@ def test_a_failing_configuration_is_recorded_and_the_study_goes_on(work, pretend
     assert trials[1].user_attrs[ERROR] == "FloatingPointError: NaN in the critic"
     assert trials[1].user_attrs[SCORES] == [1.0]
     assert trials[1].params
-    assert "1 failed" in tune.describe(trials, 4)
+    assert "1 failed" in tune_execution.describe(trials, 4)
 
 
 def test_an_impossible_configuration_fails_by_itself(work):
@@ -243,7 +245,7 @@ def test_pruning_by_the_median_of_scores_so_far(work, pretend):
     states = [trial.state for trial in trials]
     assert states == [TrialState.COMPLETE] * 5 + [TrialState.PRUNED] * 3
     assert sum(run[0] == "trial-6" for run in runs) == 1
-    assert tune.describe(trials, 8) == "8 of 8 configurations over (3 pruned, 0 failed), 0 running, best 1 (trial 0)"
+    assert tune_execution.describe(trials, 8) == "8 of 8 configurations over (3 pruned, 0 failed), 0 running, best 1 (trial 0)"
 
 
 @pytest.mark.parametrize("score", ["mean", "min"])
@@ -315,7 +317,7 @@ def test_a_lost_configuration_is_taken_up_by_another_process(work, pretend, tmp_
     args = tune.parse(arguments("--logs", str(tmp_path)))
     dying = tuner_of(args, storage)
     dying._give_back = lambda *_: None
-    scored = tuning.train
+    scored = tuner.train
 
     def die(run, *more):
         if run.seed == 1:
@@ -323,7 +325,7 @@ def test_a_lost_configuration_is_taken_up_by_another_process(work, pretend, tmp_
         return scored(run, *more)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tuning, "train", die)
+        patch.setattr(tuner, "train", die)
         with pytest.raises(Killed):
             dying.attempt(tmp_path, 5.0, None, "cpu")
     other = tuner_of(args, storage, grace=0.01)
@@ -367,12 +369,20 @@ def test_a_study_is_not_opened_with_other_settings(work, pretend):
         (["--conf-file", "others.yml"], "Hyperparameters not found"),
         (["--conf-file", "objects.py"], "The hyperparameters of td3 for Pendulum-v1 are no plain data"),
         (["--storage", "studies.db"], "must be a database's URL"),
-        (["--storage", "postgresql://127.0.0.1:1/x"], r"Error: the storage does not answer: .*127\.0\.0\.1.*goes on\."),
+        (["--storage", "sqlite://"], "in the memory of one process"),
+        (["--study", "my/study"], "must be the name of a folder"),
+        (["--env", "no_such_package:Env-v0"], "no_such_package"),
+        (["--gym-packages", "no_such_package"], "no_such_package"),
+        (["--conf-file", "text.yml"], "target_noise_clip: '5e-1' of the tuned method .td3. is text in YAML"),
+        (["--set", "train_freq=[1, stepp]"], "The tuned configurations: no model can be made: .*stepp"),
+        (["--algo", "cgp", "--set", "target_policy_noise=-1"], "no model can be made: .*`target_policy_noise`"),
+        (["--storage", "postgresql://127.0.0.1:1/x"], r"Error: the storage does not answer: .*127\.0\.0\.1.*continues\."),
     ],
 )
 def test_mistakes_end_the_command(tmp_path, monkeypatch, argv, message):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("benchmark.sweeps.storages.TABLES_TIMEOUT", 0.0)
+    Path("text.yml").write_text("default: {policy: MlpPolicy, n_timesteps: 100, target_noise_clip: 5e-1}")
     Path("others.yml").write_text("Reacher-v5: {gamma: 0.9}")
     Path("objects.py").write_text("hyperparams = {'default': {'policy': object()}}")
     with pytest.raises(SystemExit, match=message):
@@ -399,3 +409,51 @@ def test_the_command_writes_what_rl_zoo3_trains(tmp_path, monkeypatch):
     model = ALGOS["cgp"].load(tmp_path / "zoo" / "cgp" / "Pendulum-v1_1" / "Pendulum-v1.zip")
     assert 60 <= model.num_timesteps < 70
     assert (model.gamma, model.cem_samples) == (entry["gamma"], 8)
+
+
+class Process:
+    """A process that has ended."""
+
+    def poll(self):
+        return 0
+
+
+@pytest.mark.parametrize(
+    ("scores", "message"),
+    [
+        ([1.0, 3.0], None),
+        ([1.0], r"All processes have ended too early: .*worker-\*\.log say why\. The same command continues\."),
+        ([None, None], r"No configuration was scored: 2 of 2 configurations over \(0 pruned, 2 failed\)"),
+    ],
+)
+def test_the_command_says_how_a_tuning_ended(tmp_path, monkeypatch, capsys, pretend, scores, message):
+    """... when its processes, which this one stands for, have ended."""
+    storage, left = InMemoryStorage(), iter(scores)
+    monkeypatch.setattr(tune, "open_storage", lambda url: storage)
+    monkeypatch.setattr("signal.signal", lambda *args: None)
+
+    def score(run):
+        value = next(left)
+        if value is None:
+            raise FloatingPointError("NaN")
+        return value
+
+    pretend(score)
+
+    def start_workers(command, n_workers, threads, folder):
+        assert command[1:3] == ["-m", "benchmark.tune"]
+        assert command[-2:] == ["--parent", str(os.getpid())]
+        args = tune.parse(arguments("--logs", str(tmp_path), "--parent", str(os.getppid()), trials=len(scores), seeds=1))
+        own = Tuner(storage, "tune-td3-Pendulum-v1", tune.tuning_of(args), 60.0)
+        tune_execution.execute_trials(own, args)
+        return [Process()]
+
+    monkeypatch.setattr(tune_execution, "start_workers", start_workers)
+    argv = arguments("--logs", str(tmp_path), "--write", str(tmp_path / "best.yml"), seeds=1)
+    if message is not None:
+        with pytest.raises(SystemExit, match=message):
+            tune.main(argv)
+        return
+    tune.main(argv)
+    assert "benchmark.tune, trial 1: mean of 1 seeds 3 (3)" in capsys.readouterr().out
+    assert yaml.safe_load((tmp_path / "best.yml").read_text())["Pendulum-v1"]["batch_size"] == 8

@@ -1,1 +1,1 @@
-"""What the experiments, the measurements and the reports share."""
+"""Modules that sweeps, measurements and reports share."""

@@ -1,7 +1,6 @@
-"""The arguments that the measuring commands share, refused by name where they are wrong."""
+"""Types of arguments: each reads a text of the command line, and refuses it by name if it is wrong."""
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +10,16 @@ import yaml
 from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
+from benchmark.common.environments import split_env_id
+
 
 def count(text: str) -> int:
     """
-    Read a number of things.
+    Read a count.
 
     :param text: the argument
     :return: the number, at least 1
-    :raises argparse.ArgumentTypeError: if it is not such a number
+    :raises argparse.ArgumentTypeError: if it is no integer of at least 1
     """
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not an integer >= 1")
@@ -27,18 +28,18 @@ def count(text: str) -> int:
 
 def device(text: str) -> th.device:
     """
-    Read the name of a device, and see whether it is there.
+    Read the name of a device, and check that it is available.
 
-    :param text: the argument; "auto" for the GPU if there is one
+    :param text: the argument; "auto" for the GPU, if one is available
     :return: the device
-    :raises argparse.ArgumentTypeError: if there is none of that name
+    :raises argparse.ArgumentTypeError: if no such device is available
     """
     try:
         found = get_device(text)
         th.empty(0, device=found)
     except (RuntimeError, AssertionError) as error:
         raise argparse.ArgumentTypeError(f"{text!r} is not available: {str(error).splitlines()[0]}") from error
-    # SB3 quietly takes the CPU in place of a GPU that is missing
+    # SB3 silently takes the CPU in place of a missing GPU
     if found.type != text.partition(":")[0] and text != "auto":
         raise argparse.ArgumentTypeError(f"{text!r} is not available")
     return found
@@ -46,11 +47,11 @@ def device(text: str) -> th.device:
 
 def continuous_environment(text: str) -> str:
     """
-    Read the name of an environment, and see whether it can be made and has continuous actions.
+    Read the id of an environment, and check that it can be made and has continuous actions.
 
-    :param text: the argument
-    :return: the name
-    :raises argparse.ArgumentTypeError: if it cannot be used
+    :param text: the argument; ``module:Env-v0`` imports the module that registers the environment
+    :return: the id, as it is registered
+    :raises argparse.ArgumentTypeError: if the environment cannot be made, or has other actions
     """
     try:
         env = gym.make(text)
@@ -59,7 +60,7 @@ def continuous_environment(text: str) -> str:
     env.close()
     if not isinstance(env.action_space, spaces.Box):
         raise argparse.ArgumentTypeError(f"{text!r} has no continuous actions, but {env.action_space}")
-    return text
+    return split_env_id(text)[1]
 
 
 def hyperparameter(text: str) -> tuple[str, Any]:
@@ -68,7 +69,7 @@ def hyperparameter(text: str) -> tuple[str, Any]:
 
     :param text: the argument
     :return: its name and value
-    :raises argparse.ArgumentTypeError: if it is not of that form
+    :raises argparse.ArgumentTypeError: if it is not of this form, or its value is no YAML
     """
     name, separator, value = text.partition("=")
     if not separator or not name.isidentifier():
@@ -78,7 +79,7 @@ def hyperparameter(text: str) -> tuple[str, Any]:
     except yaml.YAMLError as error:
         raise argparse.ArgumentTypeError(f"{text!r} has a value that is no YAML: {error}") from error
     try:
-        # YAML takes 1e-3 for a string
+        # YAML reads 1e-3 as a string
         return name, float(read) if isinstance(read, str) else read
     except ValueError:
         return name, read
@@ -86,11 +87,11 @@ def hyperparameter(text: str) -> tuple[str, Any]:
 
 def output_folder(text: str) -> Path:
     """
-    Read the name of a folder, and make it now: a long measurement shall not end without a place for its results.
+    Read the path of a folder, and create it at once, so that no measurement ends without a folder for its results.
 
     :param text: the argument
     :return: the folder
-    :raises argparse.ArgumentTypeError: if it cannot be made
+    :raises argparse.ArgumentTypeError: if it cannot be created
     """
     folder = Path(text)
     try:
@@ -98,25 +99,3 @@ def output_folder(text: str) -> Path:
     except OSError as error:
         raise argparse.ArgumentTypeError(f"{text!r} cannot be made: {error.strerror}") from error
     return folder
-
-
-def measuring_parser(name: str, description: str, with_seed: bool = True) -> argparse.ArgumentParser:
-    """
-    Start the parser of a command that measures.
-
-    :param name: the command's module within ``benchmark``
-    :param description: what the command does
-    :param with_seed: whether it takes one seed; not if it takes several
-    :return: the parser, with the arguments that all such commands take
-    """
-    parser = argparse.ArgumentParser(prog=f"python -m benchmark.{name}", description=description)
-
-    def add(option: str, kind: Callable[[str], object], default: object, text: str) -> None:
-        parser.add_argument(option, type=kind, default=default, help=f"{text} (default: %(default)s)")
-
-    add("--threads", count, 1, "PyTorch's threads")
-    add("--device", device, "auto", "where the networks compute")
-    if with_seed:
-        add("--seed", int, 0, "seed of the random numbers")
-    add("--folder", output_folder, f"benchmark/results/{name}", "where the results go")
-    return parser

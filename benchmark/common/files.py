@@ -1,7 +1,7 @@
-"""Writing results: whole files or none, and Markdown for people beside JSON for programs."""
+"""Writing results, as whole files, and the names of files."""
 
 import json
-from collections.abc import Sequence
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,32 +13,31 @@ def write_json(path: Path, record: dict[str, Any]) -> None:
     Write a record.
 
     :param path: the file
-    :param record: what it shall hold; what JSON does not know is written as a string
+    :param record: the content; objects that JSON does not know are written as strings
     """
     write_atomically(path, (json.dumps(record, indent=2, default=str) + "\n").encode())
 
 
-def publish(folder: Path, name: str, record: dict[str, Any], text: str) -> None:
+def file_name(text: str) -> str:
     """
-    Write what a command measured, and show it.
+    Return the name of a file or a folder for a text; different texts have different names.
 
-    :param folder: where to write
+    :param text: the text, such as an environment's id or a configuration
+    :return: the text with slashes, backslashes, colons and percent signs percent-encoded
+    """
+    return re.sub(r"[%/\\:]", lambda found: f"%{ord(found[0]):02X}", text)
+
+
+def publish(folder: Path, name: str, record: dict[str, Any], text: str | None) -> None:
+    """
+    Write the measurements of a command, and print them.
+
+    :param folder: the folder of the files
     :param name: the files' name, without an extension
-    :param record: what was measured, for programs
-    :param text: the same in Markdown, for people
+    :param record: the measurements, which are written as JSON
+    :param text: the page in Markdown; None for no page
     """
     write_json(folder / f"{name}.json", record)
-    write_atomically(folder / f"{name}.md", text.encode())
-    print(text)
-
-
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """
-    Lay out a table, its first column to the left and the others to the right.
-
-    :param header: the columns' titles
-    :param rows: the cells of each row
-    :return: the table in Markdown
-    """
-    lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    if text is not None:
+        write_atomically(folder / f"{name}.md", text.encode())
+        print(text)

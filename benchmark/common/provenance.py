@@ -1,4 +1,4 @@
-"""What a figure was measured with: versions and hardware, for the records beside it."""
+"""The conditions of a measurement for its record: command, commit, versions and hardware."""
 
 import os
 import platform
@@ -30,7 +30,7 @@ PACKAGES = (
 
 def package_versions() -> dict[str, str | None]:
     """
-    List the versions of Python and of the packages that can change a result.
+    Return the versions of Python and of the packages that can change a result.
 
     :return: version by name; None for a package that is not installed
     """
@@ -45,11 +45,11 @@ def package_versions() -> dict[str, str | None]:
 
 def cpu_model() -> str:
     """
-    Name the processor as its system does.
+    Return the name of the processor.
 
-    :return: the name; the architecture's where the system gives no better
+    :return: the name; that of the architecture where the system knows no other
     """
-    # platform.processor() is empty or only the architecture on Linux
+    # On Linux, platform.processor() is empty or the architecture only
     cpu_info = Path("/proc/cpuinfo")
     if cpu_info.is_file():
         for line in cpu_info.read_text().splitlines():
@@ -60,17 +60,17 @@ def cpu_model() -> str:
 
 def machine(device: th.device) -> dict[str, Any]:
     """
-    Describe the hardware in use.
+    Describe the hardware.
 
-    :param device: where the networks live
+    :param device: device of the networks
     :return: operating system, processor, its instruction set and CEM's data type on it, cores, PyTorch's threads, device, and
-        the GPU's name
+        the name of the GPU
     """
     return {
         "system": platform.platform(),
         "cpu": cpu_model(),
         "cpu_capability": th.backends.cpu.get_cpu_capability(),
-        # What `cem_dtype="auto"` stands for here
+        # The meaning of `cem_dtype="auto"` on this hardware
         "cem_dtype": str(scoring_dtype("auto", device)).removeprefix("torch."),
         "cores": os.cpu_count(),
         "torch_threads": th.get_num_threads(),
@@ -81,9 +81,9 @@ def machine(device: th.device) -> dict[str, Any]:
 
 def commit() -> str | None:
     """
-    Name the code that runs.
+    Return the commit of the code.
 
-    :return: the commit of the clone that this file lies in, with "+" where files differ from it; None outside of a clone
+    :return: the commit of the clone that holds this file, with "+" if files differ from it; None outside of a clone
     """
     git = ["git", "-C", str(Path(__file__).parent)]
     try:
@@ -96,30 +96,29 @@ def commit() -> str | None:
 
 def conditions(module: str, argv: Sequence[str], device: th.device) -> dict[str, Any]:
     """
-    Describe how a command measures.
+    Describe the conditions of a measurement.
 
     :param module: the command's module
     :param argv: its arguments
-    :param device: where it computes
-    :return: the command line, the commit, the versions, the hardware, and how many other processes wanted the processor
-        just before
+    :param device: device of the networks
+    :return: the command line, the commit, the versions, the hardware, and the load average before the measurement
     """
     return {
         "command": shlex.join(["python", "-m", module, *argv]),
         "commit": commit(),
         "versions": package_versions(),
         "machine": machine(device),
-        # Windows has no such figure
+        # Windows has no load average
         "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
     }
 
 
 def conditions_in_words(record: dict[str, Any]) -> str:
     """
-    Say on two lines how a command measured.
+    Describe the conditions of a measurement as text.
 
-    :param record: holds what :func:`conditions` gave
-    :return: the lines, in Markdown
+    :param record: a record with the fields of :func:`conditions`
+    :return: two paragraphs, in Markdown
     """
     hardware = record["machine"]
     place = hardware["gpu"] or hardware["device"]

@@ -1,4 +1,4 @@
-"""What is known of a sweep's runs when they have ended: one record each, a line of JSON, for figures and for people."""
+"""The records of a sweep's ended runs, a line of JSON for each."""
 
 import json
 from collections.abc import Iterable
@@ -8,16 +8,17 @@ from typing import Any
 
 from sb3_cgp.common.files import write_atomically
 
-# The files of a study's folder: its records, and all else that is known of it
+# The files of a study's folder: its records, and its description
 RUNS = "runs.jsonl"
 STUDY = "study.json"
-# Of the final model, the same for all runs on a task
-FINAL_EPISODES = 20
+# Of the evaluation of a final model, the same for all runs on a task. The seed is far from those that people train with:
+# rl_zoo3 gives a run's own seed to the environments of its training.
+FINAL_EPISODES, EVALUATION_SEED = 20, 10_000
 
 
 def configuration_in_words(method: str, settings: dict[str, Any]) -> str:
     """
-    Name a configuration.
+    Return the name of a configuration.
 
     :param method: the method
     :param settings: the values of the axes, by axis
@@ -28,7 +29,7 @@ def configuration_in_words(method: str, settings: dict[str, Any]) -> str:
 
 def run_key(method: str, settings: dict[str, Any], task: str, seed: int) -> str:
     """
-    Name a run as no other run of its study is named.
+    Return a name that no other run of the study has.
 
     :param method: the method
     :param settings: the values of the axes, by axis
@@ -49,12 +50,12 @@ class Record:
     :param task: the environment
     :param settings: the values of the sweep's axes, by axis
     :param seed: the seed
-    :param steps: environment steps that it was to take
+    :param steps: environment steps that were planned
     :param timesteps: environment steps at each evaluation, ascending
     :param returns: mean return of each evaluation's episodes
     :param final: mean return of the final model over ``FINAL_EPISODES`` episodes; None for a run that failed
-    :param error: why the run failed, if it did
-    :param seconds: what it took on the clock, all attempts together
+    :param error: the error of a failed run; None for other runs
+    :param seconds: wall-clock time of all attempts together
     """
 
     experiment: str
@@ -71,7 +72,7 @@ class Record:
 
     @property
     def key(self) -> str:
-        """What tells the run from all others of its study."""
+        """A name that no other run of the study has."""
         return run_key(self.method, self.settings, self.task, self.seed)
 
 

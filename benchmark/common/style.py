@@ -1,4 +1,4 @@
-"""One look per method in all figures: colours of Okabe and Ito's palette, told apart without them by line and marker."""
+"""One style per method in all figures: colours of Okabe and Ito's palette, with different lines and markers."""
 
 import zlib
 from collections.abc import Iterable
@@ -16,7 +16,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "DDPG": dict(color="#E69F00", linestyle=(0, (4, 1, 1, 1, 1, 1)), marker="v"),
     "Random": dict(color="#7F7F7F", linestyle=(0, (1, 3)), marker="x"),
 }
-# For methods that the paper does not know
+# For methods that are not in the paper
 FURTHER: list[dict[str, Any]] = [
     dict(color=color, linestyle=linestyle, marker=marker)
     for linestyle, marker, color in product(
@@ -29,10 +29,10 @@ FURTHER: list[dict[str, Any]] = [
 
 def styles(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
     """
-    Give each method its look.
+    Return the style of each method.
 
-    :param methods: the methods, which may be unknown ones: these get a look that depends on their name alone, save for
-        two that would look the same
+    :param methods: the methods; the style of one that is not in the paper depends on its name alone, unless two would look
+        the same
     :return: Matplotlib's colour, line style and marker, by method
     """
     methods = list(methods)

@@ -72,7 +72,7 @@ def legend(figure: Figure, panel: Sequence[Axes], title: str | None = None) -> N
 
     :param figure: the figure
     :param panel: its panels
-    :param title: what it lists
+    :param title: title of the legend
     """
     entries = {label: handle for axes in panel for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     # An entry is about as wide as half a panel
@@ -87,7 +87,7 @@ def learning_curves(study: Study, task: str, repetitions: int = REPETITIONS) -> 
 
     :param study: the study
     :param task: the task
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: the picture, as PNG
     """
     figure, (left, right) = panels(2)
@@ -127,7 +127,7 @@ def stability(table: pd.DataFrame, methods: Sequence[str], repetitions: int = RE
 
     :param table: the runs' scores
     :param methods: the methods, in the legend's order
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: the picture, as PNG
     """
     tasks = list(dict.fromkeys(table["task"]))
@@ -201,7 +201,7 @@ def values(study: Study, table: pd.DataFrame, task: str, repetitions: int = REPE
     :param study: the study, with an axis
     :param table: its runs' scores
     :param task: the task
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: the picture, as PNG
     """
     figure, grid = panels(len(study.axes))
@@ -236,7 +236,7 @@ def final_rewards(study: Study, table: pd.DataFrame, repetitions: int = REPETITI
 
     :param study: the study
     :param table: its runs' scores
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: the picture, as PNG
     """
     tasks = list(dict.fromkeys(table["task"]))

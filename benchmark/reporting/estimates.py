@@ -19,7 +19,7 @@ FEWEST_RUNS = 4
 @dataclass(frozen=True)
 class Estimate:
     """
-    A number that was estimated from runs.
+    A number that is estimated from runs.
 
     :param value: the estimate
     :param interval: its 95 % interval; None where a configuration has one run only
@@ -32,7 +32,7 @@ class Estimate:
 
     def in_words(self, form: str = ".2f") -> str:
         """
-        Write the number and its interval.
+        Return the number and its interval as text.
 
         :param form: the numbers' format
         :return: such as "0.52 (0.40 to 0.61)"
@@ -51,8 +51,8 @@ def bootstrap(
 
     :param statistic: takes an array per group, (R, N, ...), of R draws of its N runs in any order, and returns (R, ...)
     :param groups: each group's cells, of shape (runs, ...)
-    :param repetitions: how often runs are drawn, R
-    :return: the statistic (...), and its 95 % interval (2, ...); None where a cell has one run only, which shows no spread
+    :param repetitions: number of bootstrap samples, R
+    :return: the statistic (...), and its 95 % interval (2, ...); None where a cell has one run only
     """
     value = statistic(*(np.concatenate(cells)[None] for cells in groups))[0]
     if any(len(cell) < 2 for cells in groups for cell in cells):
@@ -87,7 +87,7 @@ def estimate(statistic: Statistic, groups: Sequence[Sequence[np.ndarray]], repet
 
     :param statistic: takes an array per group, (R, N), and returns the number of each draw (R)
     :param groups: each group's cells
-    :param repetitions: how often runs are drawn
+    :param repetitions: number of bootstrap samples
     :return: the estimate
     """
     value, interval = bootstrap(statistic, groups, repetitions)
@@ -129,7 +129,7 @@ def compare(
     :param statistic: takes an array per method, (R, N), of a task's runs, and returns numbers (R), whose mean over tasks is
         estimated
     :param column: which scores it takes
-    :param repetitions: how often runs are drawn
+    :param repetitions: number of bootstrap samples
     :return: the estimate; None if the methods have no configuration in common
     """
     common = in_common(table, methods)
@@ -160,7 +160,7 @@ def interquartile_mean(scores: np.ndarray) -> np.ndarray:
 
 def share_reaching(scores: np.ndarray, levels: np.ndarray) -> np.ndarray:
     """
-    Count the runs that reach each level: the stability curve, a performance profile.
+    Return the share of runs that reach each level: the stability curve, a performance profile.
 
     :param scores: runs (R, N)
     :param levels: the levels (K)
@@ -194,11 +194,11 @@ def difference(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     return interquartile_mean(ours) - interquartile_mean(theirs)
 
 
-def spread(scores: np.ndarray) -> np.ndarray:
+def interquartile_range(scores: np.ndarray) -> np.ndarray:
     """
-    Measure how far runs scatter.
+    Return the interquartile range.
 
     :param scores: runs (R, N)
-    :return: the interquartile range (R)
+    :return: the upper quartile less the lower one (R)
     """
     return stats.iqr(scores, axis=1)

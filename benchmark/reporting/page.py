@@ -5,13 +5,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import quote
 
 import pandas as pd
 
-from benchmark.common.files import markdown_table
 from benchmark.common.provenance import conditions_in_words
 from benchmark.common.records import FINAL_EPISODES
-from benchmark.reporting.claims import OURS, RULES, Finding
+from benchmark.common.tables import markdown_table
+from benchmark.reporting.claims import RULES
 from benchmark.reporting.estimates import (
     REPETITIONS,
     Estimate,
@@ -22,19 +23,21 @@ from benchmark.reporting.estimates import (
     probability_of_improvement,
 )
 from benchmark.reporting.scores import FAILURE_RULE, LENGTH_RULE, Study, failed, score_table
+from benchmark.reporting.verdicts import OURS, Finding
 
 INTRODUCTION = f"""\
 # Results of sweeps
 
-A run's score is the mean return of its final model over {FINAL_EPISODES} episodes, the same for all runs on a task: what other
-episodes would change is in no interval, so small differences may be these episodes' own. {FAILURE_RULE}
-Figures and tables draw on their own study's runs, the claims and the figure of all sweeps together on those of all studies
-here. {LENGTH_RULE}
-What acting costs was measured apart, by `python -m benchmark.runtime`.
+A run's score is the mean return of its final model over {FINAL_EPISODES} episodes, which are the same for all runs on a task.
+The intervals do not contain the variance of the mean over other episodes, so small differences may be due to these episodes.
+{FAILURE_RULE}
+The figures and tables of a study use its own runs; the claims and the figure of all sweeps together use the runs of all
+studies here. {LENGTH_RULE}
+The time of inference was measured separately, by `python -m benchmark.runtime`.
 
-Intervals are 95 % percentile bootstraps by rliable; runs are drawn within each task and configuration. Few runs make them
-too narrow: on normally distributed rewards, the interval of an interquartile mean of 2, 3, 4, 5, 10 runs holds the truth in
-52, 72, 88, 89, 93 % of the cases. There is no interval where a configuration has one run only."""
+Intervals are 95 % percentile bootstrap intervals by rliable; runs are drawn within each task and configuration. Few runs make
+them too narrow: on normally distributed rewards, the interval of an interquartile mean of 2, 3, 4, 5, 10 runs contains the
+true value in 52, 72, 88, 89, 93 % of the cases. There is no interval where a configuration has one run only."""
 # Kinds of errors that are listed for a study
 ERRORS = 5
 
@@ -44,9 +47,9 @@ class Picture:
     """
     A figure on the page.
 
-    :param path: where it lies, from the page's folder
-    :param caption: what it shows
-    :param content: the picture
+    :param path: its path within the page's folder
+    :param caption: its caption
+    :param content: the picture, as PNG
     """
 
     path: str
@@ -55,12 +58,12 @@ class Picture:
 
     def in_words(self, command: str) -> str:
         """
-        Show the figure.
+        Return the figure in Markdown.
 
         :param command: the command that draws it
         :return: the figure, its caption and the command, in Markdown
         """
-        return f"![{self.caption}]({self.path})\n\n{self.caption} `{command}`"
+        return f"![{self.caption}]({quote(self.path)})\n\n{self.caption} `{command}`"
 
 
 def study_section(study: Study, pictures: Sequence[Picture], command: str, repetitions: int = REPETITIONS) -> str:
@@ -70,7 +73,7 @@ def study_section(study: Study, pictures: Sequence[Picture], command: str, repet
     :param study: the study
     :param pictures: its figures
     :param command: the command that draws them
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: the section, in Markdown
     """
     facts, table = study.facts, score_table([study])
@@ -92,7 +95,7 @@ def study_section(study: Study, pictures: Sequence[Picture], command: str, repet
 
 def commands_in_words(commands: Sequence[dict[str, Any]]) -> list[str]:
     """
-    Say what trained a study's runs.
+    Describe the commands that trained a study's runs.
 
     :param commands: the commands, from the first to the last
     :return: a paragraph for each, in Markdown
@@ -106,7 +109,7 @@ def commands_in_words(commands: Sequence[dict[str, Any]]) -> list[str]:
 
 def progress(study: Study) -> str:
     """
-    Say how many of the planned runs have ended, and why runs failed.
+    Describe the progress of a study, and the errors of its failed runs.
 
     :param study: the study
     :return: the lines, in Markdown
@@ -114,7 +117,7 @@ def progress(study: Study) -> str:
     planned, lost = study.facts["runs_planned"], [record for record in study.records if failed(record)]
     lines = [f"{len(study.records):,} of {planned:,} planned runs have ended, {len(lost):,} of them failed."]
     if len(study.records) < planned:
-        lines[0] += " **The rest is missing: what follows may change.**"
+        lines[0] += " **The rest is missing: the results below may change.**"
     reasons = Counter((record.method, _first_line(record.error or "the final reward is no number")) for record in lost)
     lines += [
         f"- {method}: `{reason}` ({number} run{'s' * (number > 1)})"
@@ -127,11 +130,11 @@ def progress(study: Study) -> str:
 
 def reward_tables(table: pd.DataFrame, study: Study, repetitions: int = REPETITIONS) -> list[str]:
     """
-    Tabulate final rewards: by method, and, folded away, by configuration.
+    Tabulate final rewards: by method, and, in a section that is folded, by configuration.
 
     :param table: the runs' scores
     :param study: the study
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: the tables, in Markdown
     """
     tables = [_reward_table(table, ["task", "method"], study, repetitions)]
@@ -156,7 +159,7 @@ def _reward_table(table: pd.DataFrame, columns: list[str], study: Study, repetit
 
 
 def _form(scores: pd.Series) -> str:
-    """Choose decimals by the range of a task's rewards: about three digits that matter."""
+    """Return the number format for the range of a task's rewards: about three significant digits."""
     width = float(scores.max() - scores.min())
     return f".{max(0, 3 - math.floor(math.log10(width))) if width > 0 else 1}f"
 
@@ -167,7 +170,7 @@ def improvement_table(table: pd.DataFrame, methods: Sequence[str], repetitions: 
 
     :param table: the runs' scores
     :param methods: the methods, in the rows' order
-    :param repetitions: how often the bootstrap draws runs
+    :param repetitions: number of bootstrap samples
     :return: the table, in Markdown; empty without CGP or without others
     """
     tasks = list(dict.fromkeys(table["task"]))
@@ -202,12 +205,12 @@ def claims_section(findings: Sequence[Finding]) -> str:
     """
     Report on the paper's claims.
 
-    :param findings: what the runs say of each
+    :param findings: the findings on the claims
     :return: the section, in Markdown
     """
     rows = [[finding.claim, f"**{finding.verdict}**", finding.text] for finding in findings]
-    lines = ["| " + " | ".join(row) + " |" for row in [["claim", "verdict", "what the data say"], ["---"] * 3, *rows]]
-    return "\n\n".join(["## The paper's claims", "\n".join(lines), RULES])
+    table = markdown_table(["claim", "verdict", "what the data say"], rows, align="left")
+    return "\n\n".join(["## The paper's claims", table, RULES])
 
 
 def pooled_section(picture: Picture, command: str) -> str:
@@ -223,7 +226,7 @@ def pooled_section(picture: Picture, command: str) -> str:
 
 def page(sections: Sequence[str]) -> str:
     """
-    Put the page together.
+    Return the page.
 
     :param sections: its sections
     :return: the page, in Markdown

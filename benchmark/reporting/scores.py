@@ -18,7 +18,7 @@ LENGTH_RULE = (
 )
 FAILURE_RULE = (
     "A run that failed counts with the lowest return that any evaluation of any run on its task reached, and its learning "
-    "curve goes on at that return from its failure on."
+    "curve continues at that return from its failure on."
 )
 
 
@@ -28,8 +28,8 @@ class Study:
     A sweep, finished or still going on.
 
     :param name: the folder's name
-    :param folder: where it was read from
-    :param facts: what ``study.json`` says
+    :param folder: its folder
+    :param facts: the content of ``study.json``
     :param records: the runs that have ended
     """
 
@@ -64,7 +64,7 @@ class Study:
 
     def place(self, settings: dict[str, Any]) -> tuple[int, ...]:
         """
-        Say where a configuration stands among all.
+        Return the place of a configuration among all.
 
         :param settings: value by axis
         :return: the number of each axis's value; -1 for an axis that it lacks
@@ -101,10 +101,10 @@ def read_study(folder: Path) -> Study:
 
 def longest(studies: Sequence[Study]) -> list[Study]:
     """
-    Leave out what was tried in small, so that it does not weigh as much as what was run in earnest.
+    Return the studies without shorter trial runs, which must not weigh as much as the longest ones.
 
     :param studies: the studies
-    :return: them, with only those runs than which their experiment has no longer ones on the task; none that has no such run
+    :return: the studies with the longest runs of each experiment on each task; those that have none of these are left out
     """
     steps: dict[tuple[str, str], int] = {}
     for record in (record for study in studies for record in study.records):
@@ -120,7 +120,7 @@ def longest(studies: Sequence[Study]) -> list[Study]:
 
 def settings_in_words(settings: dict[str, Any]) -> str:
     """
-    Name a configuration.
+    Return the name of a configuration.
 
     :param settings: value by axis
     :return: such as "learning rate 0.001, batch size 64"; empty without an axis
@@ -130,7 +130,7 @@ def settings_in_words(settings: dict[str, Any]) -> str:
 
 def axis_in_words(axis: str) -> str:
     """
-    Name an axis.
+    Return the name of an axis.
 
     :param axis: the axis
     :return: its name for people
@@ -140,7 +140,7 @@ def axis_in_words(axis: str) -> str:
 
 def value_in_words(value: Any) -> str:
     """
-    Name an axis's value.
+    Return the name of an axis's value.
 
     :param value: the value
     :return: its name for people
@@ -152,17 +152,17 @@ def value_in_words(value: Any) -> str:
 
 def failed(record: Record) -> bool:
     """
-    Tell whether a run has no score of its own.
+    Return whether a run has no score of its own.
 
     :param record: the run
-    :return: whether it raised an error or ended at no number
+    :return: whether it raised an error, or its final return is not finite
     """
     return record.final is None or not math.isfinite(record.final)
 
 
 def floors(records: Iterable[Record]) -> dict[str, float]:
     """
-    Find what failed runs count with, as :data:`FAILURE_RULE` says.
+    Return the score of failed runs, as :data:`FAILURE_RULE` defines it.
 
     :param records: the runs
     :return: by task, the lowest return of any evaluation
@@ -229,19 +229,19 @@ def evaluation_grid(records: Iterable[Record], task: str) -> np.ndarray:
 
 def curves(records: Sequence[Record], floor: float, grid: np.ndarray) -> np.ndarray:
     """
-    Put learning curves side by side.
+    Return learning curves on a common grid.
 
     :param records: the runs, at least one
-    :param floor: what a failed run counts with
+    :param floor: the return of a failed run after its failure
     :param grid: environment steps (E)
-    :return: returns (N, E): a run's own, on straight lines between
+    :return: returns (N, E), interpolated linearly between evaluations
     """
     lines = np.full((len(records), len(grid)), floor)
     for line, record in zip(lines, records, strict=True):
         timesteps, returns = np.array(record.timesteps, dtype=float), np.array(record.returns, dtype=float)
         known = np.isfinite(returns)
         if known.any():
-            # A failed run has only what it reached
+            # A failed run has returns before its failure only
             shown = grid <= timesteps[known][-1] if failed(record) else np.ones(len(grid), dtype=bool)
             line[shown] = np.interp(grid[shown], timesteps[known], returns[known])
     return lines

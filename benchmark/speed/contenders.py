@@ -14,14 +14,14 @@ from benchmark.speed.plain import PlainPolicy
 
 BATCH_SIZE = 128
 NET_ARCH = [256, 256]
-# Enough for what is measured: memory that is never written costs nothing, but not every allocator knows that
+# Enough for the measured steps: a larger buffer takes time with allocators that write all of it
 BUFFER_SIZE = 100_000
 REFERENCE = "TD3"
 
 
 class RandomAgent:
     """
-    Acts at random, by the interface of SB3's models.
+    Acts at random, with the interface of SB3's models.
 
     :param env: the environment to act in
     """
@@ -33,8 +33,8 @@ class RandomAgent:
         """
         Draw an action for each environment.
 
-        :param observation: the observations; of no influence
-        :param deterministic: of no influence either
+        :param observation: ignored
+        :param deterministic: ignored
         :return: the actions, and no recurrent state
         """
         return np.array([self.action_space.sample() for _ in range(self.n_envs)]), None
@@ -45,10 +45,10 @@ class Contender:
     """
     A method to measure.
 
-    :param package: where its algorithm comes from; None for random actions
+    :param package: the package of its algorithm; None for random actions
     :param algorithm: the algorithm's name there
     :param paper_train: the paper's training time, as a ratio to TD3's; None where it has none
-    :param paper_inference: the paper's inference time, in the same way
+    :param paper_inference: the paper's inference time, as a ratio to TD3's; None where it has none
     :param kwargs: the algorithm's arguments besides the common ones
     :param policy: the policy
     """
@@ -79,10 +79,10 @@ CONTENDERS = {
 
 def takes_cem_dtype(name: str) -> bool:
     """
-    Tell whether a method scores by our fast way, whose data type can be chosen.
+    Return whether a method has the argument ``cem_dtype``.
 
     :param name: the method
-    :return: whether it does
+    :return: whether it is CGP with its own scoring
     """
     return CONTENDERS[name].algorithm == "CGP" and CONTENDERS[name].policy is not PlainPolicy
 
@@ -91,13 +91,13 @@ def make_agent(
     name: str, env: VecEnv, learning_starts: int, seed: int, device: th.device, **kwargs: Any
 ) -> OffPolicyAlgorithm | RandomAgent:
     """
-    Make a method's untrained model.
+    Return the untrained model of a method.
 
     :param name: the method
     :param env: the environment to train in
     :param learning_starts: random steps before the first gradient step
     :param seed: seed of its random numbers
-    :param device: where its networks compute
+    :param device: device of its networks
     :param kwargs: further arguments of the algorithm
     :return: the model
     :raises ImportError: if the algorithm's package is not installed

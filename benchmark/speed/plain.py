@@ -1,4 +1,4 @@
-"""CGP as one would first write it: the yardstick for the speed of ours."""
+"""CGP with its critic called on repeated observations, the reference for the speed of the package's CGP."""
 
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
@@ -14,7 +14,7 @@ class PlainPolicy(CGPPolicy):
     """
     CGP's policy with the observation repeated for every sample, in float32, one operation at a time.
 
-    Its networks are SB3's. It takes the critic in the mode that it finds it in: right only for networks without dropout and
+    Its networks are SB3's. It does not set the critic's training mode, and so is right only for networks without dropout and
     batch norm.
     """
 
@@ -32,4 +32,5 @@ class PlainPolicy(CGPPolicy):
         """
         features = critic.extract_features(observation, critic.features_extractor)
         score = repeated_q_score(critic.q_networks[0], features)
+        assert self.selector is not None
         return self.selector.select(score, len(features), get_action_dim(self.action_space), features.device)

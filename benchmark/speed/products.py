@@ -1,5 +1,5 @@
 """
-The arithmetic of one CEM call, and the bare matrix products that it cannot do without: the floor under its time.
+The arithmetic of one CEM call, and its matrix products alone, whose time is the lower bound of the call's.
 
 Shapes: B states, N samples per state, A action dimensions, F features, H units of each of two hidden layers.
 """
@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import torch as th
 
-# Rows of the blocks that are tried besides the whole: on a CPU, a block that stays in cache is often faster
+# Rows of the blocks that are tried, besides all rows at once: on a CPU, a block that stays in cache is often faster
 BLOCK_ROWS = (256, 1024, 2048)
-# Multiplies (rows, H) by a linear layer's weights, (H, H), and may use the tensor that is there for the result
+# Multiplies (rows, H) by a linear layer's weights, (H, H), and may write to a given tensor
 Kernel = Callable[[th.Tensor, th.Tensor, th.Tensor], object]
 
 
@@ -43,8 +43,9 @@ class Sizes:
 
 def call_flops(sizes: Sizes) -> int:
     """
-    Count a CEM call's useful floating-point operations: those of the critic's matrix products, a multiplication and an
-    addition each, with the states' part of the first layer computed once. Sampling, activations and sorting are not counted.
+    Return the number of a CEM call's useful floating-point operations: a multiplication and an addition for each weight in the
+    critic's matrix products, with the states' part of the first layer computed once. Sampling, activations and sorting are not
+    counted.
 
     :param sizes: the call's sizes
     :return: the operations
@@ -56,7 +57,7 @@ def call_flops(sizes: Sizes) -> int:
 
 def product_flops(sizes: Sizes) -> int:
     """
-    Count the operations of the bare products: (B N, H) times (H, H) once per iteration, from hidden layer to hidden layer.
+    Return the number of operations of the bare products: (B N, H) times (H, H) once per iteration, between the hidden layers.
 
     :param sizes: the call's sizes
     :return: the operations
@@ -66,11 +67,11 @@ def product_flops(sizes: Sizes) -> int:
 
 def outer_products(sizes: Sizes, device: th.device) -> Callable[[], object]:
     """
-    Make the call's other products, all in float32: the states' part of the first layer once; per iteration the actions' part,
-    (B N, A) times (A, H), and the last layer, (B N, H) times (H, 1). Operands and results are allocated here, once.
+    Return the call's other products, all in float32: once the states' part of the first layer; per iteration the actions'
+    part, (B N, A) times (A, H), and the last layer, (B N, H) times (H, 1). Operands and results are allocated here, once.
 
     :param sizes: the call's sizes
-    :param device: where to compute
+    :param device: the device
     :return: the function to time
     """
 
@@ -91,13 +92,13 @@ def outer_products(sizes: Sizes, device: th.device) -> Callable[[], object]:
 
 def kernels(device: th.device) -> dict[str, Kernel]:
     """
-    List the ways of multiplying that are worth trying: which is the fastest differs between processors.
+    Return the ways of multiplying to try: the fastest differs between processors.
 
-    :param device: where to compute
+    :param device: the device
     :return: the ways, by name
     """
     found: dict[str, Kernel] = {"mm": lambda left, weight, result: th.mm(left, weight.t(), out=result)}
-    # PyTorch's compiler uses it and keeps it private; float32's `mm` is MKL's, at half this speed on AMD's processors
+    # Private, as only PyTorch's compiler calls it; `mm` in float32 is MKL's, which has half its speed on AMD's processors
     onednn_linear = getattr(th.ops.mkldnn, "_linear_pointwise", None)
     if device.type == "cpu" and th.backends.mkldnn.is_available() and onednn_linear is not None:
         found["oneDNN"] = lambda left, weight, result: onednn_linear(left, weight, None, "none", [], "")
@@ -106,14 +107,14 @@ def kernels(device: th.device) -> dict[str, Kernel]:
 
 def bare_products(sizes: Sizes, dtype: th.dtype, device: th.device) -> dict[str, Callable[[], object]]:
     """
-    Make the bare products of a CEM call, in one piece and in blocks that are reused, so that they stay in cache.
+    Return the bare products of a CEM call, in one piece and in blocks that are reused, so that they stay in cache.
 
     Operands are allocated here, once, and so are results where the kernel allows it.
 
     :param sizes: the call's sizes
     :param dtype: the data type
-    :param device: where to compute
-    :return: the functions to time, by name; the fastest is the floor
+    :param device: the device
+    :return: the functions to time, by name; the fastest is the lower bound
     """
     blocks = {"whole": sizes.actions}
     blocks.update({f"blocks of {rows} rows": rows for rows in BLOCK_ROWS if rows < sizes.actions})

@@ -1,9 +1,9 @@
-"""The run-time table in Markdown, with what one must know to read it."""
+"""The run-time table in Markdown, with the notes on it."""
 
 from typing import Any
 
-from benchmark.common.files import markdown_table
 from benchmark.common.provenance import conditions_in_words
+from benchmark.common.tables import markdown_table
 from benchmark.speed.contenders import BATCH_SIZE, NET_ARCH, REFERENCE
 
 NOTES = f"""\
@@ -20,10 +20,10 @@ sample, in float32. SBX's TD3 computes with JAX, on JAX's own threads and defaul
 
 def cells(measured: dict[str, Any] | None) -> list[str]:
     """
-    Write a time as three cells of the table.
+    Return a time as three cells of the table.
 
     :param measured: seconds and ratios; None if the method was not timed
-    :return: seconds, ratio and the paper's ratio, "-" for what there is not
+    :return: seconds, ratio and the paper's ratio, "-" for a missing one
     """
     if measured is None:
         return ["-", "-", "-"]
@@ -36,7 +36,7 @@ def markdown(record: dict[str, Any]) -> str:
     """
     Write the table.
 
-    :param record: what was measured, and how
+    :param record: the measurements and their conditions
     :return: the table and its notes, in Markdown
     """
     header = ["method", "train, s", f"/ {REFERENCE}", "paper", "inference, s", f"/ {REFERENCE}", "paper"]

@@ -1,4 +1,4 @@
-"""The figure of how the cost of training grows: a small panel for everything that is varied."""
+"""The figure of the cost of training: a panel for each axis and quantity."""
 
 import io
 from typing import Any
@@ -17,7 +17,7 @@ AXIS_TITLES = {
     "observation_dim": "observation dimensions",
     "n_envs": "parallel environments",
 }
-# Value in the points, title of the vertical axis, and the factor between the two
+# By the name in the points: title of the vertical axis, and the factor to its unit
 QUANTITIES = {
     "gradient_step_seconds": ("ms per gradient step", 1e3),
     "env_steps_per_second": ("environment steps per second", 1.0),
@@ -28,9 +28,9 @@ COLUMNS = 4
 
 def panels(points: list[dict[str, Any]]) -> list[tuple[str, str]]:
     """
-    Choose the panels.
+    Return the panels of the figure.
 
-    :param points: what was measured
+    :param points: the measurements
     :return: axis and quantity of each panel, in the order in which they were measured
     """
     return [
@@ -43,9 +43,9 @@ def panels(points: list[dict[str, Any]]) -> list[tuple[str, str]]:
 
 def draw(record: dict[str, Any]) -> bytes:
     """
-    Draw what was measured, on logarithmic scales.
+    Draw the measurements, on logarithmic scales.
 
-    :param record: holds the points, and how they were measured
+    :param record: the points and their conditions
     :return: the picture, as PNG
     """
     chosen = panels(record["points"])

@@ -1,4 +1,4 @@
-"""Timing several things in turn, so that a drift of the machine's speed hits all of them alike."""
+"""Timing of several functions in turn, so that a drift of the machine's speed affects all of them alike."""
 
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -14,10 +14,10 @@ CPU = th.device("cpu")
 
 def timed(run: Callable[[], object], device: th.device = CPU) -> float:
     """
-    Time one call, with all the work that it leaves to the device.
+    Time one call, with all its work on the device.
 
-    :param run: what to time
-    :param device: where it computes
+    :param run: the function to time
+    :param device: the device that it computes on
     :return: seconds
     """
     _synchronise(device)
@@ -36,13 +36,13 @@ def interleaved(
     callables: Mapping[Key, Callable[[], object]], rounds: int, burn_in: int = 1, device: th.device = CPU, title: str = ""
 ) -> dict[Key, list[float]]:
     """
-    Time callables in turn: once each per round, every round beginning with the next one.
+    Time functions in turn: each once per round, where each round begins with the next function.
 
-    :param callables: what to time, by name
-    :param rounds: how often to time each
+    :param callables: the functions to time, by name
+    :param rounds: number of timed rounds
     :param burn_in: untimed rounds before the first timed one
-    :param device: where they compute
-    :param title: named beside a bar of the progress; without it, no bar
+    :param device: the device that they compute on
+    :param title: title of the progress bar; empty for no bar
     :return: seconds of each call, by name, in the order of the rounds
     """
     names = list(callables)
@@ -58,7 +58,7 @@ def interleaved(
 
 def summary(values: Sequence[float]) -> dict[str, Any]:
     """
-    Summarise measurements of one thing.
+    Summarise measurements.
 
     :param values: the measurements
     :return: their median, lower and upper quartile, and all of them
@@ -69,10 +69,10 @@ def summary(values: Sequence[float]) -> dict[str, Any]:
 
 def ratio(seconds: Sequence[float], reference: Sequence[float]) -> float:
     """
-    Compare two things timed in turn: the median of the rounds' ratios, from which a slow round drops out.
+    Compare two functions that were timed in turn: the median of the rounds' ratios is robust to slow rounds.
 
-    :param seconds: one thing's times, by round
-    :param reference: the other's
+    :param seconds: the times of the one, by round
+    :param reference: the times of the other, by round
     :return: the median ratio
     """
     return float(np.median(np.divide(seconds, reference)))

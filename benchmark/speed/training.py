@@ -1,14 +1,13 @@
-"""Training as rl_zoo3 does it, with its hyperparameters and nothing left behind but the model."""
+"""Training as rl_zoo3 does it, with its hyperparameters, which leaves no files."""
 
 import argparse
-import os
 import tempfile
-from contextlib import redirect_stdout
 from typing import Any
 
 import torch as th
 from rl_zoo3.exp_manager import ExperimentManager
 
+from benchmark.common.zoo import silence
 from sb3_cgp import CGP
 from sb3_cgp.zoo.registration import register
 
@@ -20,11 +19,11 @@ def train_by_zoo(env_id: str, hyperparams: dict[str, Any], seed: int, device: th
     :param env_id: the environment
     :param hyperparams: hyperparameters that differ from the YAML file's
     :param seed: the seed
-    :param device: where the networks compute
+    :param device: device of the networks
     :return: the trained model
     """
     register()
-    with tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
+    with tempfile.TemporaryDirectory() as folder, silence():
         manager = ExperimentManager(
             argparse.Namespace(),
             "cgp",

@@ -1,1 +1,1 @@
-"""Sweeps and tuning as Optuna studies that many processes work off together."""
+"""Sweeps and tuning as Optuna studies whose runs many processes execute together."""

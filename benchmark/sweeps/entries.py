@@ -1,27 +1,23 @@
-"""Entries of rl_zoo3's YAML files: what a task starts from, what a sample makes of it, and writing the result."""
+"""Entries of rl_zoo3's YAML files: the entry of a task, the entry of a sampled configuration, and writing an entry."""
 
-import argparse
-import contextlib
-import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
-from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 
+from benchmark.common.zoo import read_entry
 from benchmark.sweeps.sweep_files import Hyperparams
 from sb3_cgp.common.files import write_atomically
-from sb3_cgp.zoo.registration import register
 
-# What only rl_zoo3's samplers of replay buffers suggest
+# The parameters that only rl_zoo3's sampler for hindsight replay suggests
 HER_KWARGS = ("n_sampled_goal", "goal_selection_strategy")
 
 
 def base_entry(algo: str, task: str, conf_file: str | None = None) -> Hyperparams:
     """
-    Read what a task's hyperparameters are before any is sampled, as ``rl_zoo3.train`` does.
+    Read the hyperparameters of a task before any of them is sampled, as ``rl_zoo3.train`` does.
 
     :param algo: the algorithm's name in rl_zoo3
     :param task: the environment
@@ -29,22 +25,17 @@ def base_entry(algo: str, task: str, conf_file: str | None = None) -> Hyperparam
     :return: the entry
     :raises ValueError: if the file has none for the task, and no default, or one that no YAML file can hold
     """
-    register()
-    manager = ExperimentManager(argparse.Namespace(), algo, task, "", config=conf_file, verbose=0)
-    # It prints what it reads
-    with contextlib.redirect_stdout(io.StringIO()):
-        hyperparams, _ = manager.read_hyperparameters()
     try:
-        return yaml.safe_load(yaml.safe_dump(dict(hyperparams)))
+        return yaml.safe_load(yaml.safe_dump(read_entry(algo, task, conf_file)))
     except yaml.YAMLError as error:
         raise ValueError(f"The hyperparameters of {algo} for {task} are no plain data: {error}") from error
 
 
 def sampled_entry(algo: str, base: Hyperparams, params: Mapping[str, Any]) -> Hyperparams:
     """
-    Put what a trial has suggested in an entry, as a YAML file has it.
+    Return the entry of a YAML file with the parameters of a trial.
 
-    rl_zoo3's samplers return objects that no YAML file can hold. Its converters make hyperparameters of the same suggestions,
+    rl_zoo3's samplers return objects that no YAML file can hold. Its converters make hyperparameters of the same parameters,
     but not always such that a YAML file may have them.
 
     :param algo: the algorithm's name in rl_zoo3
@@ -59,7 +50,7 @@ def sampled_entry(algo: str, base: Hyperparams, params: Mapping[str, Any]) -> Hy
     if her_kwargs:
         sampled["replay_buffer_kwargs"] = _in_python(_evaluated(base.get("replay_buffer_kwargs", {})) | her_kwargs)
     entry = {**base, **sampled}
-    # rl_zoo3's converters say "no noise" by None, which is no argument of the algorithms; what the base has goes with it
+    # rl_zoo3's converters use None for no noise, which is no argument of the algorithms; then the base entry's std goes, too
     if entry.get("noise_type") is None:
         entry.pop("noise_type", None)
         entry.pop("noise_std", None)
@@ -73,21 +64,21 @@ def _in_python(arguments: Mapping[str, Any]) -> str:
 
 
 def _evaluated(arguments: str | dict[str, Any]) -> dict[str, Any]:
-    # As rl_zoo3 does with the same text
+    # As rl_zoo3 evaluates the same text
     return eval(arguments) if isinstance(arguments, str) else arguments
 
 
 def write_entry(path: Path, task: str, entry: Hyperparams, comment: str) -> None:
     """
-    Write a task's entry into a YAML file, in place of the one that it has; nothing else of the file changes.
+    Write a task's entry into a YAML file, in place of its present entry; nothing else of the file changes.
 
-    :param path: the file; it is made if it is missing
+    :param path: the file, which is created if it is missing
     :param task: the environment
     :param entry: the hyperparameters
-    :param comment: a line on where they come from
+    :param comment: a line on the origin of the hyperparameters
     :raises ValueError: if the file is not one of entries by task, or another entry refers to the one to be replaced
     """
-    # A link stays one, and lines end as they did
+    # A symbolic link stays one, and lines end as before
     path = path.resolve()
     text = path.read_bytes().decode() if path.is_file() else ""
     ending = "\r\n" if "\r\n" in text else "\n"
@@ -113,13 +104,13 @@ def _loaded(text: str) -> Any:
 
 
 def _lines_of(task: str, text: str) -> tuple[int, int]:
-    """Find the lines of a task's entry: from its key to before what follows it, or none at the end of the file."""
+    """Return the first line of a task's entry and the line after its last; twice the number of lines if it has none."""
     lines = text.splitlines()
     root = yaml.compose(text, Loader=yaml.SafeLoader)
     for key, value in root.value if isinstance(root, yaml.MappingNode) else ():
         if key.value == task:
             start, end = key.start_mark.line, value.end_mark.line + (value.end_mark.column > 0)
-            # Comments before the next entry are that entry's
+            # Comments before the next entry belong to that entry
             while end > start + 1 and (not lines[end - 1].strip() or lines[end - 1].startswith("#")):
                 end -= 1
             return start, end

@@ -1,4 +1,4 @@
-"""A study's runs as small text files, for figures and to be kept in a repository."""
+"""The runs of a study as small text files, for figures and for a repository."""
 
 import json
 from collections.abc import Sequence
@@ -10,19 +10,20 @@ from optuna.trial import TrialState
 from benchmark.common.files import write_json
 from benchmark.common.records import RUNS, STUDY, Record, read_records, write_records
 from benchmark.sweeps.storages import open_storage
-from benchmark.sweeps.studies import Ledger, owned
-from benchmark.sweeps.sweep_files import SweepError
+from benchmark.sweeps.study_trials import owned
+from benchmark.sweeps.study_view import StudyView
+from benchmark.sweeps.validation import SweepError
 
-# Options that say where files and databases are, and may hold a password
+# Options with the paths of files and the URLs of databases, which may hold a password
 PRIVATE = ("--storage", "--logs", "--results")
 
 
 def without_places(argv: Sequence[str]) -> list[str]:
     """
-    Leave out of a command line what is of no influence on results, and no one else's business.
+    Return a command line without the options that have no influence on results, and may be private.
 
     :param argv: the arguments
-    :return: those without the places of files and databases
+    :return: the arguments without the paths of files and the URLs of databases
     """
     kept: list[str] = []
     for argument in argv:
@@ -35,33 +36,33 @@ def without_places(argv: Sequence[str]) -> list[str]:
 
 def export_study(name: str, storage_url: str, results: Path) -> Path:
     """
-    Write what is known of a study's ended runs, and what the study is.
+    Write the records of a study's ended runs, and the study's description.
 
     :param name: the study's name
-    :param storage_url: where the study is
+    :param storage_url: the URL of its storage
     :param results: the folder of all studies' results
     :return: the study's own folder, in it
     :raises KeyError: if there is no such study
-    :raises SweepError: if the folder has runs that the study lacks, which would be lost
+    :raises SweepError: if the folder holds runs that the study lacks, which would be lost
     """
-    ledger = Ledger(open_storage(storage_url), name)
+    study = StudyView(open_storage(storage_url), name)
     folder = results / name
-    see_that_none_is_lost(folder, ledger)
-    write_json(folder / STUDY, ledger.description())
-    write_records(folder, ledger.records())
+    check_no_run_is_lost(folder, study)
+    write_json(folder / STUDY, study.description())
+    write_records(folder, study.records())
     return folder
 
 
-def see_that_none_is_lost(folder: Path, ledger: Ledger) -> None:
+def check_no_run_is_lost(folder: Path, study: StudyView) -> None:
     """
-    See that a study has all runs that its folder of results has, before these are written anew.
+    Check that a study has all runs that its folder of results holds, before these are written anew.
 
     :param folder: the study's folder of results
-    :param ledger: the study
+    :param study: the study
     :raises SweepError: if it lacks some
     """
     exported = {record.key for record in read_records(folder)} if (folder / RUNS).is_file() else set()
-    lacking = exported - {key for key, trial in owned(ledger.trials()).items() if trial.state is not TrialState.WAITING}
+    lacking = exported - {key for key, trial in owned(study.trials()).items() if trial.state is not TrialState.WAITING}
     if lacking:
         problem = f"has {len(lacking)} ended runs that the study lacks, such as {min(lacking)}"
         remedy = "Take them by --adopt, with the methods and seeds that they are of, or choose another folder by --results"
@@ -70,12 +71,12 @@ def see_that_none_is_lost(folder: Path, ledger: Ledger) -> None:
 
 def ended_runs(folder: Path, description: dict[str, Any]) -> tuple[list[Record], list[dict[str, Any]]]:
     """
-    Read what was exported of a study's runs, to go on with it where its storage is not at hand.
+    Read the exported runs of a study, to continue it with another storage.
 
     :param folder: the study's folder of results
-    :param description: what the sweep is
+    :param description: the sweep's description
     :return: the runs, and the commands that trained them
-    :raises SweepError: if they were trained with other settings, naming one
+    :raises SweepError: if they were trained with other settings; it names one
     """
     if not (folder / STUDY).is_file():
         return [], []

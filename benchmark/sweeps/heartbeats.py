@@ -1,4 +1,4 @@
-"""How a process that works on a trial is known to be alive: by a heartbeat among the trial's attributes."""
+"""Heartbeats among the attributes of trials, by which other processes know that a trial's process is alive."""
 
 import os
 import signal
@@ -13,29 +13,29 @@ from optuna.trial import FrozenTrial, TrialState
 
 from benchmark.sweeps.storages import patiently
 
-# Seconds between two heartbeats, and until a silent process is given up, by default
+# Defaults: seconds between two heartbeats, and seconds of silence after which a process is taken for lost
 BEAT, GRACE = 5.0, 60.0
-# Seconds between two looks after which the looker does not trust the silence, if the grace is short
+# Seconds between two searches after which silence is not trusted, if the grace period is short
 LONGEST_ABSENCE = 10.0
 
-# The attribute of a trial that changes while its process is alive
+# The attribute of a trial that changes as long as its process is alive
 PROGRESS = "progress"
 
 
 class TrialLostError(RuntimeError):
-    """This process was given up by another: the trial is not its own any more."""
+    """Another process has ended this process's trial."""
 
 
 def send_beat(storage: BaseStorage, trial_id: int, count: str, step: int, seconds: float) -> None:
     """
-    Say that this process is alive, and how far its trial is.
+    Report that this process is alive, and the progress of its trial.
 
-    :param storage: where the trial is
+    :param storage: the storage of the trial
     :param trial_id: the trial
-    :param count: what has not been said yet
+    :param count: a text that no earlier heartbeat had
     :param step: environment steps so far
-    :param seconds: what this attempt has taken so far
-    :raises TrialLostError: if the trial is not this process's any more
+    :param seconds: wall-clock time of this attempt so far
+    :raises TrialLostError: if another process has ended the trial
     """
     progress = {"beat": count, "step": step, "seconds": round(seconds, 1)}
     try:
@@ -44,24 +44,24 @@ def send_beat(storage: BaseStorage, trial_id: int, count: str, step: int, second
         raise TrialLostError(f"trial {trial_id}") from error
 
 
-class Heart:
+class HeartbeatThread:
     """
-    A thread that tells a study, again and again, that this process is alive, and sees whether it should be.
+    A thread that reports at intervals that this process is alive, and ends the process with its parent.
 
-    :param beat: tells it: takes what has not been said yet, environment steps so far, and seconds so far
-    :param interval: seconds between two beats
-    :param parent: the process that started this one; when it is gone, this one is to end. None for no such process
+    :param beat: sends a heartbeat; takes a text that no earlier one had, environment steps and seconds so far
+    :param interval: seconds between two heartbeats
+    :param parent: the process that started this one, whose end is this one's, too; None for no such process
     """
 
     def __init__(self, beat: Callable[[str, int, float], None], interval: float, parent: int | None = None):
-        self._tell, self._interval, self._parent = beat, interval, parent
+        self._send, self._interval, self._parent = beat, interval, parent
         self._start = time.monotonic()
         self._step = 0
         self._has_ended = threading.Event()
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)
 
-    def __enter__(self) -> "Heart":
+    def __enter__(self) -> "HeartbeatThread":
         self._thread.start()
         return self
 
@@ -71,10 +71,10 @@ class Heart:
 
     def watch(self, step: int) -> None:
         """
-        Note how far the run is.
+        Set the progress of the run.
 
         :param step: environment steps
-        :raises TrialLostError: if the run is not this process's any more
+        :raises TrialLostError: if another process has ended the trial
         """
         self._step = step
         if self._error is not None:
@@ -84,7 +84,7 @@ class Heart:
         beat = 0
         while self._error is None:
             try:
-                self._tell(f"{os.getpid()}-{beat}", self._step, time.monotonic() - self._start)
+                self._send(f"{os.getpid()}-{beat}", self._step, time.monotonic() - self._start)
             except Exception as error:
                 self._error = error
             if self._parent is not None and os.getppid() != self._parent:
@@ -93,42 +93,43 @@ class Heart:
             beat += 1
             if self._has_ended.wait(self._interval):
                 break
-        # The last word on what it took
+        # The wall-clock time in all
         if self._error is None:
             try:
-                self._tell(f"{os.getpid()}-end", self._step, time.monotonic() - self._start)
+                self._send(f"{os.getpid()}-end", self._step, time.monotonic() - self._start)
             except Exception as error:
                 self._error = error
 
 
-class Silence:
+class SilenceDetector:
     """
-    Finds trials whose processes have fallen silent.
+    Finds trials whose processes have sent no heartbeat for longer than the grace period.
 
-    A looker that was away itself, as while the database was, counts from its return: the others had no way to be heard.
+    After a pause between two searches, as while the database did not answer, silence counts anew: other processes could not
+    report either.
 
     :param grace: seconds of silence after which a process is taken for lost
-    :param clock: tells seconds
+    :param clock: returns seconds
     """
 
     def __init__(self, grace: float, clock: Callable[[], float] = time.monotonic):
         self._grace = grace
         self._clock = clock
-        # By trial, the heartbeat that was seen last, and when it was first seen
+        # By trial, the last heartbeat, and the time when it was first read
         self._seen: dict[int, tuple[Any, float]] = {}
-        self._last_look: float | None = None
+        self._last_search: float | None = None
 
     def find(self, trials: Iterable[FrozenTrial]) -> list[FrozenTrial]:
         """
-        Look at a study's trials.
+        Return the trials of processes that have fallen silent.
 
-        :param trials: the trials
-        :return: those that run, and whose heartbeat has stood still in all looks for longer than the grace
+        :param trials: a study's trials
+        :return: those that run, and whose heartbeat has been the same in all searches for longer than the grace period
         """
         now = self._clock()
-        if self._last_look is not None and now - self._last_look > max(self._grace / 2, LONGEST_ABSENCE):
+        if self._last_search is not None and now - self._last_search > max(self._grace / 2, LONGEST_ABSENCE):
             self._seen = {}
-        self._last_look = now
+        self._last_search = now
         silent = []
         for trial in trials:
             if trial.state is TrialState.RUNNING:

@@ -1,4 +1,4 @@
-"""Processes that work for another: how they are started, are told to end, and heed it."""
+"""Processes that train: how a command starts and stops them, and how they handle signals."""
 
 import argparse
 import os
@@ -12,45 +12,53 @@ from benchmark.common.arguments import count
 from benchmark.sweeps.heartbeats import BEAT, GRACE
 from benchmark.sweeps.storages import DEFAULT_STORAGE
 
-# The exit code of a process that was told to end
+# Seconds between two reads of a study of which nothing waits
+PAUSE = 2.0
+# The exit code of a process that ended because of SIGTERM
 TERMINATED = 128 + signal.SIGTERM
 
 
 def add_workers(parser: argparse.ArgumentParser, logs: str) -> None:
     """
-    Let a command line say where a study is, and what works it off.
+    Add the arguments on the storage of a study, and on the processes that train its runs.
 
     :param parser: the command's parser
-    :param logs: where the runs go by default
+    :param logs: the default folder of the runs
     """
     parser.add_argument(
         "--storage", default=DEFAULT_STORAGE, help="a database's URL, or grpc://host:port (default: %(default)s)"
     )
+    parser.add_argument(
+        "--gym-packages", nargs="+", default=[], help="modules to import, which register environments, as in rl_zoo3"
+    )
     parser.add_argument("--workers", type=count, default=1, help="processes on this machine (default: %(default)s)")
     parser.add_argument("--threads", type=count, help="PyTorch's threads in each (default: the cores' share)")
-    parser.add_argument("--device", default="auto", help="where the networks compute (default: %(default)s)")
-    parser.add_argument("--logs", type=Path, default=Path(logs), help="where the runs go (default: %(default)s)")
+    parser.add_argument("--device", default="auto", help="device of the networks (default: %(default)s)")
+    parser.add_argument("--logs", type=Path, default=Path(logs), help="folder of the runs (default: %(default)s)")
     add_heartbeats(parser)
 
 
 def add_heartbeats(parser: argparse.ArgumentParser) -> None:
     """
-    Let a command line say how a process that was killed is noticed.
+    Add the arguments on heartbeats, by which a process that was killed is noticed.
 
     :param parser: the command's parser
     """
     parser.add_argument("--beat", type=float, default=BEAT, help="seconds between two heartbeats (default: %(default)s)")
     parser.add_argument(
-        "--grace", type=float, default=GRACE, help="seconds until a silent process is given up (default: %(default)s)"
+        "--grace",
+        type=float,
+        default=GRACE,
+        help="seconds of silence after which a process is taken for lost (default: %(default)s)",
     )
 
 
-def see_that_grace_is_longer(beat: float, grace: float) -> None:
+def check_grace(beat: float, grace: float) -> None:
     """
-    See that a living process is not taken for a silent one.
+    Check that a living process is not taken for a lost one.
 
     :param beat: seconds between two heartbeats
-    :param grace: seconds until a silent process is given up
+    :param grace: seconds of silence after which a process is taken for lost
     :raises ValueError: if the grace is no longer than two heartbeats
     """
     if not 0 < 2 * beat < grace:
@@ -59,7 +67,7 @@ def see_that_grace_is_longer(beat: float, grace: float) -> None:
 
 def share_of_cores(n_workers: int) -> int:
     """
-    Share the machine's cores out.
+    Divide the machine's cores among processes.
 
     :param n_workers: number of processes
     :return: threads for each
@@ -69,16 +77,16 @@ def share_of_cores(n_workers: int) -> int:
 
 def start_workers(command: Sequence[str], n_workers: int, threads: int, folder: Path) -> list[subprocess.Popen[bytes]]:
     """
-    Start processes that train.
+    Start processes that train runs.
 
     :param command: the command line of each
-    :param n_workers: how many
-    :param threads: each one's threads
-    :param folder: where their logs go
+    :param n_workers: number of processes
+    :param threads: threads of each
+    :param folder: folder of their logs
     :return: the processes
     """
     folder.mkdir(parents=True, exist_ok=True)
-    # A library's threads are counted when it is loaded
+    # OpenMP reads this when it is loaded
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
     workers = []
     for number in range(n_workers):
@@ -89,7 +97,7 @@ def start_workers(command: Sequence[str], n_workers: int, threads: int, folder: 
 
 def stop(workers: Sequence[subprocess.Popen[bytes]]) -> None:
     """
-    Let processes save their runs' states, and end.
+    End processes, which save the states of their runs before.
 
     :param workers: the processes
     """
@@ -100,17 +108,17 @@ def stop(workers: Sequence[subprocess.Popen[bytes]]) -> None:
         for worker in workers:
             worker.wait()
     except KeyboardInterrupt:
-        # Asked a second time
+        # Ctrl-C a second time
         for worker in workers:
             worker.kill()
 
 
 def terminate(number: int, frame: FrameType | None) -> None:
     """
-    End as a process that was told to.
+    End the process with the exit code of a signal.
 
     :param number: the signal
-    :param frame: where the process was
+    :param frame: the frame that the signal interrupted
     :raises SystemExit: always
     """
     raise SystemExit(128 + number)
@@ -120,13 +128,13 @@ def _terminate_as_asked(number: int, frame: FrameType | None) -> None:
     signal.raise_signal(signal.SIGTERM)
 
 
-def listen(parent: int | None) -> None:
+def install_signal_handlers(parent: int | None) -> None:
     """
-    Heed signals as a process does that trains: SIGTERM has its run saved and given back.
+    Handle signals as a process that trains: on SIGTERM its run is saved and given back.
 
-    :param parent: the process that started this one, if one did
+    :param parent: the process that started this one; None for a process started by hand
     """
     signal.signal(signal.SIGTERM, terminate)
-    # Ctrl-C in a terminal reaches all of its processes: this one's parent tells it to end. Without one it is to give its run
-    # back: rl_zoo3 takes Ctrl-C for a training's end.
+    # Ctrl-C in a terminal reaches all of its processes: the parent then ends this one. Without a parent it gives its run back,
+    # as rl_zoo3 takes Ctrl-C for the end of a training.
     signal.signal(signal.SIGINT, _terminate_as_asked if parent is None else signal.SIG_IGN)

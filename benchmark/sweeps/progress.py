@@ -1,4 +1,4 @@
-"""How far a sweep is, for whoever waits for it."""
+"""The progress of a sweep: counts of runs, speed and time left."""
 
 import sys
 import time
@@ -11,25 +11,25 @@ from optuna.trial import FrozenTrial, TrialState
 from rich.progress import BarColumn, Progress, TextColumn
 
 from benchmark.sweeps.heartbeats import PROGRESS
-from benchmark.sweeps.studies import ERROR, owned
+from benchmark.sweeps.study_trials import ERROR, owned
 
-# Seconds over which the speed is measured; over which it is for the time left, as a step's cost differs from run to run, and
-# policies that are trained offline take time without any; and between two lines where there is no terminal
+# Seconds over which the speed is measured, over which it is measured for the time left, and between two lines without a
+# terminal. The second is long as a step's cost differs from run to run, and offline policy training takes no step.
 WINDOW, LONG_WINDOW, LINE_INTERVAL = 120.0, 3600.0, 60.0
 
 
 @dataclass(frozen=True)
-class Standing:
+class SweepProgress:
     """
-    How far a sweep is.
+    The progress of a sweep.
 
-    :param runs: runs in all
-    :param done: runs that are completed
-    :param running: runs that are being trained
-    :param failed: runs that failed for their own reasons
+    :param runs: number of runs
+    :param done: number of completed runs
+    :param running: number of runs that processes train
+    :param failed: number of runs that failed for their own reasons
     :param share: share of all environment steps that has been taken
-    :param speed: environment steps per second, of all processes together; None while it is not known
-    :param seconds_left: an estimate; None while it is not known
+    :param speed: environment steps per second, of all processes together; None before it is known
+    :param seconds_left: the estimated time left; None before it is known
     """
 
     runs: int
@@ -52,24 +52,24 @@ def _clock(seconds: float) -> str:
     return f"{hours}:{rest // 60:02}:{rest % 60:02}"
 
 
-class Pace:
+class RateEstimator:
     """
-    Measures the speed of a count that grows.
+    Measures the growth rate of a count.
 
-    :param window: seconds that are looked back upon
+    :param window: length of the sliding window in seconds
     """
 
     def __init__(self, window: float):
         self._window = window
         self._history: deque[tuple[float, int]] = deque()
 
-    def look(self, now: float, count: int) -> float | None:
+    def add(self, now: float, count: int) -> float | None:
         """
-        Take the count in.
+        Add a measurement.
 
         :param now: the time in seconds
         :param count: the count
-        :return: its growth per second; None if it has not grown
+        :return: the growth per second within the window; None if the count has not grown
         """
         self._history.append((now, count))
         while now - self._history[0][0] > self._window:
@@ -78,24 +78,24 @@ class Pace:
         return (count - count_then) / (now - then) if now > then and count > count_then else None
 
 
-class Tally:
+class ProgressTracker:
     """
-    Counts a study's runs and steps.
+    Counts the runs and steps of a study.
 
     :param steps: environment steps of each run
     """
 
     def __init__(self, steps: int):
         self._steps = steps
-        self._pace, self._long_pace = Pace(WINDOW), Pace(LONG_WINDOW)
+        self._rate, self._long_rate = RateEstimator(WINDOW), RateEstimator(LONG_WINDOW)
 
-    def look(self, trials: Sequence[FrozenTrial], now: float | None = None) -> Standing:
+    def add(self, trials: Sequence[FrozenTrial], now: float | None = None) -> SweepProgress:
         """
-        Take the study's trials in.
+        Add a read of the study's trials.
 
         :param trials: the trials
         :param now: the time in seconds; by default that of a clock
-        :return: how far it is
+        :return: the progress
         """
         now = time.monotonic() if now is None else now
         runs = list(owned(trials).values())
@@ -103,43 +103,43 @@ class Tally:
         ended = [trial for trial in runs if trial.state.is_finished()]
         taken = self._steps * len(ended) + sum(trial.user_attrs.get(PROGRESS, {}).get("step", 0) for trial in running)
         total = self._steps * len(runs)
-        long_speed = self._long_pace.look(now, taken)
+        long_speed = self._long_rate.add(now, taken)
         failed = sum(ERROR in trial.user_attrs for trial in ended)
-        return Standing(
+        return SweepProgress(
             runs=len(runs),
             done=len(ended) - failed,
             running=len(running),
             failed=failed,
             share=taken / max(total, 1),
-            speed=self._pace.look(now, taken),
+            speed=self._rate.add(now, taken),
             seconds_left=None if long_speed is None else (total - taken) / long_speed,
         )
 
 
 @contextmanager
-def display(title: str) -> Iterator[Callable[[Standing], None]]:
+def display(title: str) -> Iterator[Callable[[SweepProgress], None]]:
     """
-    Show how far a sweep is: a bar in a terminal, a line now and then elsewhere.
+    Show the progress of a sweep: a bar in a terminal, a line every minute elsewhere.
 
     :param title: the sweep's name
-    :return: takes the standing
+    :return: a function that shows the progress
     """
     if not sys.stderr.isatty():
-        yield _line_now_and_then(title)
+        yield _print_at_intervals(title)
         return
-    with Progress(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[standing]}")) as progress:
-        task = progress.add_task(title, total=1.0, standing="")
-        yield lambda standing: progress.update(task, completed=standing.share, standing=str(standing))
+    with Progress(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[counts]}")) as bar:
+        task = bar.add_task(title, total=1.0, counts="")
+        yield lambda progress: bar.update(task, completed=progress.share, counts=str(progress))
 
 
-def _line_now_and_then(title: str) -> Callable[[Standing], None]:
+def _print_at_intervals(title: str) -> Callable[[SweepProgress], None]:
     last: list[float] = []
 
-    def show(standing: Standing) -> None:
+    def show(progress: SweepProgress) -> None:
         now = time.monotonic()
-        is_over = standing.done + standing.failed == standing.runs
-        if not last or now - last[-1] >= LINE_INTERVAL or is_over:
+        has_ended = progress.done + progress.failed == progress.runs
+        if not last or now - last[-1] >= LINE_INTERVAL or has_ended:
             last[:] = [now]
-            print(f"{title}: {standing}", file=sys.stderr, flush=True)
+            print(f"{title}: {progress}", file=sys.stderr, flush=True)
 
     return show

@@ -12,14 +12,14 @@ NAME = "random"
 
 class RandomActions(TD3):
     """
-    Acts at random and learns nothing, by the interface of SB3's algorithms.
+    Acts at random and learns nothing, with the interface of SB3's algorithms.
 
     :param args: TD3's arguments, of which only the environment and the seed are of influence
     :param kwargs: TD3's arguments
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
-        # Random steps without end, and no memory for what nobody will learn from
+        # All steps are random, and no transition is ever sampled
         super().__init__(*args, **{**kwargs, "learning_starts": 2**62, "buffer_size": 1})
 
     def predict(
@@ -40,12 +40,12 @@ class RandomActions(TD3):
         """
         assert isinstance(self.action_space, spaces.Box)
         first = next(iter(observation.values())) if isinstance(observation, dict) else observation
-        # As SB3 tells them apart, also for images whose channels come first
+        # SB3's own test for a batch, which knows images with the channels first, too
         _, is_batch = self.policy.obs_to_tensor(observation)
         actions = [self.action_space.sample() for _ in range(len(first) if is_batch else 1)]
         return np.array(actions) if is_batch else actions[0], state
 
 
 def register_random_actions() -> None:
-    """Make random actions known to rl_zoo3, as the algorithm ``random``."""
+    """Register random actions with rl_zoo3, as the algorithm ``random``."""
     ALGOS[NAME] = RandomActions

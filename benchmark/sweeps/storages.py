@@ -1,4 +1,4 @@
-"""Opening Optuna's storages for many processes at once, and being patient with a database that is away for a while."""
+"""Opening Optuna's storages for many processes at once, and repeating calls while a database does not answer."""
 
 import time
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 Result = TypeVar("Result")
 
-# What says that the database, and not the call, is at fault. Optuna lets some of SQLAlchemy's errors through.
+# Errors of the database, and not of the call. Optuna does not convert all of SQLAlchemy's errors.
 STORAGE_ERRORS = (optuna.exceptions.StorageInternalError, SQLAlchemyError, grpc.RpcError, ConnectionError)
 DEFAULT_STORAGE = "sqlite:///logs/sweeps/studies.db"
 # Seconds that SQLite waits for another process's writing
@@ -26,11 +26,11 @@ TABLES_TIMEOUT = 5.0
 
 def open_storage(url: str) -> BaseStorage:
     """
-    Open a storage, and make it if it is a file of SQLite that is missing.
+    Open a storage, and create it if it is a file of SQLite that is missing.
 
     :param url: SQLAlchemy's URL of a database, or ``grpc://host:port`` of Optuna's proxy in front of one
     :return: the storage
-    :raises ValueError: if it is neither, or the database's driver is not installed
+    :raises ValueError: if it is neither, the database's driver is not installed, or the database is in memory
     """
     parts = urlsplit(url)
     if parts.scheme == "grpc":
@@ -39,70 +39,88 @@ def open_storage(url: str) -> BaseStorage:
                 f"The value of `storage` is {url!r}, but must have a host and a port, as in grpc://localhost:13000"
             )
         return GrpcStorageProxy(host=parts.hostname, port=parts.port)
-    try:
-        database = make_url(url)
-        # What SQLAlchemy takes for PostgreSQL's driver depends on its version
-        if database.drivername == "postgresql":
-            database = database.set(drivername="postgresql+psycopg2")
-        # The driver of the database
-        create_engine(database)
-    except (ArgumentError, ImportError) as error:
-        raise ValueError(f"The value of `storage` is {url!r}, but must be a database's URL: {error}") from error
+    database = _read_url(url)
     if database.get_backend_name() != "sqlite":
         return get_storage(_open_database(database, {"pool_pre_ping": True}))
-    if database.database:
-        Path(database.database).parent.mkdir(parents=True, exist_ok=True)
+    assert database.database is not None
+    Path(database.database).parent.mkdir(parents=True, exist_ok=True)
     storage = _open_database(database, {"connect_args": {"timeout": SQLITE_TIMEOUT}})
     _make_transactions_exclusive(storage)
     return get_storage(storage)
 
 
+def _read_url(url: str) -> URL:
+    try:
+        database = make_url(url)
+        # SQLAlchemy's default driver for PostgreSQL depends on its version
+        if database.drivername == "postgresql":
+            database = database.set(drivername="postgresql+psycopg2")
+        is_in_memory = database.get_backend_name() == "sqlite" and _is_in_memory(database)
+        if not is_in_memory:
+            # Imports the driver
+            create_engine(database)
+    except (ArgumentError, ImportError) as error:
+        raise ValueError(f"The value of `storage` is {url!r}, but must be a database's URL: {error}") from error
+    if is_in_memory:
+        raise ValueError(
+            f"The value of `storage` is {url!r}, a database in the memory of one process, but must be one that other "
+            f"processes reach, such as {DEFAULT_STORAGE}"
+        )
+    return database
+
+
+def _is_in_memory(database: URL) -> bool:
+    """Return whether a database of SQLite is in memory, as its URL says it in one of several ways."""
+    name = database.database or ""
+    return name in ("", "file:") or ":memory:" in name or database.query.get("mode") == "memory"
+
+
 def _open_database(database: URL, engine_kwargs: dict[str, Any]) -> RDBStorage:
     url = database.render_as_string(hide_password=False)
-    # Of several processes that find no tables, all but one fail in making them
+    # Of several processes that find no tables, all but one fail to create them
     return patiently(RDBStorage, url, engine_kwargs, patience=TABLES_TIMEOUT)
 
 
 def _make_transactions_exclusive(storage: RDBStorage) -> None:
     """
-    Let a transaction of SQLite's hold the database from its start, as SQLAlchemy's documentation does it.
+    Let a transaction of SQLite lock the database from its start, as SQLAlchemy's documentation does it.
 
     Otherwise two processes may both read that a trial waits before either writes that it takes it.
     """
 
     @event.listens_for(storage.engine, "connect")
-    def leave_transactions_to_us(connection: Any, record: Any) -> None:
+    def disable_the_drivers_transactions(connection: Any, record: Any) -> None:
         connection.isolation_level = None
 
     @event.listens_for(storage.engine, "begin")
     def begin(connection: Any) -> None:
         connection.exec_driver_sql("BEGIN IMMEDIATE")
 
-    # Connections from before
+    # Close the connections that were opened without these listeners
     storage.engine.dispose()
 
 
 def reason_of(error: BaseException) -> str:
     """
-    Say why a storage does not answer.
+    Return why a storage does not answer.
 
     :param error: one of ``STORAGE_ERRORS``
-    :return: its first line, without Optuna's words around it
+    :return: the first line of the error that Optuna's error was raised from
     """
     return str(error.__cause__ or error).splitlines()[0]
 
 
 def patiently(call: Callable[..., Result], *args: Any, patience: float = 300.0, **kwargs: Any) -> Result:
     """
-    Ask a storage again and again while its database does not answer.
+    Repeat a call of a storage while its database does not answer.
 
-    A call that has taken effect although its answer was lost is made twice: let it be one for which that does no harm.
+    A call that has taken effect although its answer was lost is made twice, which must do no harm.
 
     :param call: a method of the storage
     :param args: its arguments
-    :param patience: seconds until its error is taken for an answer
+    :param patience: seconds after which its error is raised
     :param kwargs: its arguments
-    :return: what it returns
+    :return: the result of the call
     """
     start, pause = time.monotonic(), 0.1
     while True:

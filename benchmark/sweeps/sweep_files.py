@@ -1,36 +1,24 @@
-"""The form of the files in ``hyperparams/sweeps``, and what is wrong with one that is not of it."""
+"""The form of the files in ``hyperparams/sweeps``, and the errors of a file that is not of this form."""
 
-import difflib
-from collections.abc import Sequence
-from pathlib import Path
 from string import Template
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
-import gymnasium as gym
-import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
-from pydantic_core import ErrorDetails
+from huggingface_sb3 import EnvironmentName
+from pydantic import AfterValidator, BaseModel, Field, PositiveInt, model_validator
 from rl_zoo3 import ALGOS
 
+from benchmark.common.environments import (
+    import_packages,
+    registered_environment,
+    split_env_id,
+)
 from benchmark.sweeps.random_actions import register_random_actions
+from benchmark.sweeps.validation import Strict
 from sb3_cgp.zoo.registration import register
 
 Hyperparams = dict[str, Any]
-# What Optuna can tell from each other
+# The types of values that Optuna distinguishes
 Value = bool | int | float | str | None
-
-
-class SweepError(ValueError):
-    """
-    A sweep's file, or what was to be changed of it, is wrong.
-
-    :param place: the file, or the option
-    :param key: what is wrong there
-    :param problem: how, and what is allowed
-    """
-
-    def __init__(self, place: object, key: str, problem: str):
-        super().__init__(f"{place}: {key}: {problem}" if key else f"{place}: {problem}")
 
 
 def _known_algorithm(name: str) -> str:
@@ -41,18 +29,26 @@ def _known_algorithm(name: str) -> str:
     return name
 
 
-def known_task(name: str) -> str:
-    """
-    See that an environment is registered.
+def _imported(packages: list[str]) -> list[str]:
+    try:
+        import_packages(packages)
+    except ImportError as error:
+        raise ValueError(f"must be modules that can be imported: {error}") from error
+    return list(dict.fromkeys(packages))
 
-    :param name: the environment
-    :return: the name
-    :raises ValueError: if it is not registered
-    """
-    if name not in gym.registry:
-        close = difflib.get_close_matches(name, list(gym.registry), n=3)
-        raise ValueError("must be a registered environment" + (f", such as {', '.join(close)}" if close else ""))
-    return name
+
+def _with_distinct_names(tasks: list[str]) -> list[str]:
+    ids: dict[str, str] = {}
+    for env_id in tasks:
+        # The name in rl_zoo3's folders
+        name = str(EnvironmentName(env_id))
+        if name in ids:
+            raise ValueError(
+                f"{ids[name]!r} and {env_id!r} have the same name in rl_zoo3's folders, {name}: run them as two sweeps, with "
+                "a --study for each"
+            )
+        ids[name] = env_id
+    return tasks
 
 
 def _with_numbers(hyperparams: Hyperparams) -> Hyperparams:
@@ -68,13 +64,17 @@ def _all_different(values: list[Any]) -> list[Any]:
     return values
 
 
-class _Strict(BaseModel):
-    """Data with no keys but those that are declared."""
+class Packages(Strict):
+    """
+    Packages that a command line names.
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    :param gym_packages: modules to import, which register environments
+    """
+
+    gym_packages: Annotated[list[str], AfterValidator(_imported)]
 
 
-class Method(_Strict):
+class Method(Strict):
     """
     A method to compare.
 
@@ -84,13 +84,13 @@ class Method(_Strict):
     """
 
     algo: Annotated[str, AfterValidator(_known_algorithm)]
-    hyperparams: Annotated[Hyperparams, AfterValidator(_with_numbers)] = {}
+    hyperparams: Annotated[Hyperparams, AfterValidator(_with_numbers)] = Field(default_factory=dict)
     tuned: bool = False
 
 
-class Axis(_Strict):
+class Axis(Strict):
     """
-    What is varied.
+    An axis of a sweep: the hyperparameters that are varied, and their values.
 
     :param values: a list of values, or names of values with the hyperparameters that each stands for
     :param sets: the hyperparameters that are set, where ``$value`` stands for the value; for a list of values, by
@@ -100,13 +100,13 @@ class Axis(_Strict):
 
     values: Annotated[list[Value], Field(min_length=1)] | Annotated[dict[str, Hyperparams], Field(min_length=1)]
     sets: Hyperparams | None = None
-    sets_for: dict[str, Hyperparams] = {}
+    sets_for: dict[str, Hyperparams] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _check(self) -> "Axis":
         if isinstance(self.values, dict):
             if self.sets is not None or self.sets_for:
-                raise ValueError("`sets` and `sets_for` are for a list of values: named values say what they set themselves")
+                raise ValueError("`sets` and `sets_for` are for a list of values: named values set their own hyperparameters")
         elif len(set(map(str, self.values))) < len(self.values):
             raise ValueError("`values` must differ from each other, also when they are written out")
         for template in (self.sets or {}, *self.sets_for.values()):
@@ -115,7 +115,7 @@ class Axis(_Strict):
 
     def hyperparams(self, name: str, value: Any, method: str) -> Hyperparams:
         """
-        Tell what a value stands for.
+        Return the hyperparameters that a value of the axis stands for.
 
         :param name: the axis
         :param value: one of its values
@@ -129,7 +129,7 @@ class Axis(_Strict):
 
 
 def _fill(template: Any, value: Any) -> Any:
-    """Put a value in its places, also in those within lists and mappings."""
+    """Return a template with the value in place of ``$value``, also within lists and mappings."""
     if template == "$value":
         return value
     if isinstance(template, dict):
@@ -144,13 +144,14 @@ def _fill(template: Any, value: Any) -> Any:
         raise ValueError(f"`sets` has {template!r}, but only $value stands for something ($$ is a dollar sign)") from error
 
 
-class SweepFile(_Strict):
+class SweepFile(Strict):
     """
-    A sweep as its file says it.
+    The content of a sweep's file.
 
-    :param title: what it is, in a few words
+    :param title: the sweep's subject, in a few words
+    :param gym_packages: modules to import, which register environments, as ``--gym-packages`` of rl_zoo3 does
     :param methods: names from ``methods.yml`` beside the file, or methods of its own by name
-    :param tasks: environments
+    :param tasks: environments; an id of the form ``module:Env-v0`` adds the module to ``gym_packages``
     :param steps: environment steps of each run
     :param seeds: how many seeds, from 0, or a list of seeds
     :param evaluation_interval: environment steps between two evaluations
@@ -158,13 +159,22 @@ class SweepFile(_Strict):
     :param checkpoint_interval: environment steps between two states to go on from; by default a tenth of the run,
         from 1,000 to 10,000
     :param hyperparams: hyperparameters for all methods
-    :param axes: what is varied, by name
+    :param axes: the axes, by name
     :param exclude: combinations of the axes' values to leave out
     """
 
+    parts: ClassVar[dict[str, type[BaseModel]]] = {"axes": Axis, "methods": Method}
+
     title: str
     methods: Annotated[list[str], Field(min_length=1)] | Annotated[dict[str, Method], Field(min_length=1)]
-    tasks: Annotated[list[Annotated[str, AfterValidator(known_task)]], Field(min_length=1), AfterValidator(_all_different)]
+    # Before the tasks, which are validated in this order
+    gym_packages: Annotated[list[str], AfterValidator(_imported)] = Field(default_factory=list)
+    tasks: Annotated[
+        list[Annotated[str, AfterValidator(registered_environment)]],
+        Field(min_length=1),
+        AfterValidator(_all_different),
+        AfterValidator(_with_distinct_names),
+    ]
     steps: PositiveInt
     seeds: (
         PositiveInt
@@ -173,9 +183,27 @@ class SweepFile(_Strict):
     evaluation_interval: PositiveInt
     evaluation_episodes: PositiveInt = 10
     checkpoint_interval: PositiveInt | None = None
-    hyperparams: Hyperparams = {}
-    axes: dict[str, Axis] = {}
-    exclude: list[dict[str, Any]] = []
+    hyperparams: Hyperparams = Field(default_factory=dict)
+    axes: dict[str, Axis] = Field(default_factory=dict)
+    exclude: list[dict[str, Any]] = Field(default_factory=list)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _split_tasks(cls, content: Any) -> Any:
+        """Move the modules of ids of the form ``module:Env-v0`` to the packages that every worker imports."""
+        tasks, packages = content.get("tasks"), content.get("gym_packages", [])
+        if not isinstance(tasks, list) or not isinstance(packages, list):
+            return content
+        names, modules = [], []
+        for task in tasks:
+            try:
+                module, name = split_env_id(task)
+            except (AttributeError, ValueError):
+                # The task's own validator names the mistake
+                module, name = [], task
+            names.append(name)
+            modules += module
+        return {**content, "tasks": names, "gym_packages": [*packages, *modules]}
 
     @model_validator(mode="after")
     def _check(self) -> "SweepFile":
@@ -194,68 +222,13 @@ class SweepFile(_Strict):
         return self
 
 
-class Inclusion(_Strict):
+class Inclusion(Strict):
     """
     A file that stands for several sweeps.
 
-    :param title: what it is, in a few words
+    :param title: the subject, in a few words
     :param includes: the sweeps' names
     """
 
     title: str
     includes: Annotated[list[str], Field(min_length=1)]
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """
-    Read a file of keys and values.
-
-    :param path: the file
-    :return: its content
-    :raises SweepError: if it cannot be read, or is something else
-    """
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, yaml.YAMLError) as error:
-        raise SweepError(path, "", f"cannot be read: {error}") from error
-    if not isinstance(content, dict):
-        raise SweepError(path, "", "must be a mapping of keys to values")
-    return content
-
-
-def validated(kind: type[Any], content: Any, place: object, *keys: str) -> Any:
-    """
-    Make a model of data.
-
-    :param kind: the model's class
-    :param content: the data
-    :param place: where it comes from
-    :param keys: where it is there
-    :return: the model
-    :raises SweepError: if the data does not fit
-    """
-    try:
-        return kind.model_validate(content)
-    except ValidationError as error:
-        problems = [(".".join([*keys, *_location(each)]), _problem(each, kind)) for each in _telling(error.errors())]
-        raise SweepError(place, problems[0][0], "; ".join(dict.fromkeys(problem for _, problem in problems))) from error
-
-
-def _telling(errors: Sequence[ErrorDetails]) -> Sequence[ErrorDetails]:
-    """Leave out that a list is no mapping, or the reverse, where the other alternative says what is wrong."""
-    telling = [each for each in errors if each["type"] not in ("list_type", "dict_type", "model_type", "int_type")]
-    return telling or errors
-
-
-def _location(error: ErrorDetails) -> list[str]:
-    # The names of alternatives are pydantic's own
-    return [str(part) for part in error["loc"] if not str(part).startswith(("list[", "dict[", "constrained-"))]
-
-
-def _problem(error: ErrorDetails, kind: type[BaseModel]) -> str:
-    given = "" if error["type"] == "missing" or isinstance(error["input"], dict) else f" (it is {error['input']!r})"
-    if error["type"] == "extra_forbidden":
-        owners: dict[str, type[BaseModel]] = {"axes": Axis, "methods": Method}
-        owner = owners.get(str(error["loc"][0]), kind)
-        return f"is not known: it must be one of {', '.join(owner.model_fields)}"
-    return error["msg"].removeprefix("Value error, ") + given

@@ -1,0 +1,180 @@
+"""The figures of studies, which follow from their runs, and the page that shows them with the commands that draw them."""
+
+import itertools
+import json
+import re
+import shlex
+import zlib
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmark.common.records import RUNS
+from benchmark.reporting.claims import findings
+from benchmark.reporting.drawing import final_rewards, learning_curves, sensitivity, stability, values
+from benchmark.reporting.estimates import REPETITIONS
+from benchmark.reporting.page import Picture, claims_section, page, pooled_section, study_section
+from benchmark.reporting.scores import Study, axis_in_words, longest, read_study, score_table
+from sb3_cgp.common.files import write_atomically
+
+FOLDER = Path("benchmark/results/sweeps")
+RUNTIME = Path(__file__).parent.parent / "results/runtime/runtime.json"
+PAGE = "results.md"
+FIGURES = "figures"
+FIGURES_ONLY = "--figures-only"
+STABILITY = "Stability: the share of runs, {}, that reach at least a final reward, with pointwise 95 % bands."
+
+
+def study_folders(out: Path = FOLDER) -> list[Path]:
+    """
+    Return the folders of all studies.
+
+    :param out: the folder of the results
+    :return: their folders, by name
+    """
+    return sorted(runs.parent for runs in out.glob(f"*/{RUNS}"))
+
+
+def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPETITIONS, with_page: bool = True) -> Path:
+    """
+    Draw the figures of studies, and write their page.
+
+    :param folders: the studies' folders
+    :param out: the folder of the page and the figures
+    :param repetitions: number of bootstrap samples
+    :param with_page: whether the page is written; if not, an earlier one stays
+    :return: the page
+    :raises FileNotFoundError: if a folder holds no study
+    :raises ValueError: if two have the same name
+    """
+    studies = [read_study(folder) for folder in folders]
+    names = [study.name for study in studies]
+    if len(set(names)) < len(names):
+        raise ValueError(f"Two of these studies have the same name: {', '.join(names)}")
+    in_earnest = longest(studies)
+    together = stability_together(in_earnest, repetitions)
+    pictures = [draw(study, repetitions) for study in studies]
+    for picture in [*together, *itertools.chain(*pictures)]:
+        write_atomically(out / picture.path, picture.content)
+    if with_page:
+        found = findings(score_table(in_earnest), read_runtime(), repetitions)
+        command = command_line(folders, out, repetitions)
+        sections = [f"`{command}` writes this page.", claims_section(found)]
+        sections += [pooled_section(picture, f"{command} {FIGURES_ONLY}") for picture in together]
+        for study, own in zip(studies, pictures, strict=True):
+            # A study's figures depend on nothing else
+            command = f"{command_line([study.folder], out, repetitions)} {FIGURES_ONLY}"
+            sections.append(study_section(study, own, command, repetitions))
+        write_atomically(out / PAGE, page(sections).encode())
+    return out / PAGE
+
+
+def command_line(folders: Sequence[Path], out: Path, repetitions: int) -> str:
+    """
+    Return the command that draws the same figures.
+
+    :param folders: the studies' folders
+    :param out: the folder of the page and the figures
+    :param repetitions: number of bootstrap samples
+    :return: the command
+    """
+
+    def shown(path: Path) -> str:
+        here = Path.cwd()
+        return (path.resolve().relative_to(here) if path.resolve().is_relative_to(here) else path).as_posix()
+
+    arguments = [shown(folder) for folder in folders]
+    if shown(out) != FOLDER.as_posix():
+        arguments += ["--folder", shown(out)]
+    if repetitions != REPETITIONS:
+        arguments += ["--repetitions", str(repetitions)]
+    return shlex.join(["python", "-m", "benchmark.figures", *arguments])
+
+
+def read_runtime() -> dict[str, Any] | None:
+    """
+    Read the record of ``benchmark.runtime``.
+
+    :return: its record; None without one
+    """
+    return json.loads(RUNTIME.read_text()) if RUNTIME.is_file() else None
+
+
+def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
+    """
+    Draw a study's figures: with axes, its stability and its sensitivity; without, its learning curves and final rewards.
+
+    :param study: the study
+    :param repetitions: number of bootstrap samples
+    :return: the figures; none before the first run has ended
+    """
+    if not study.records:
+        return []
+    table = score_table([study])
+
+    names = task_names(list(dict.fromkeys([*study.facts["tasks"], *study.tasks])))
+
+    def picture(kind: str, caption: str, content: bytes, task: str | None = None) -> Picture:
+        name = kind if task is None else f"{kind}_{names[task]}"
+        return Picture(f"{FIGURES}/{study.name}/{name}.png", caption, content)
+
+    if not study.axes:
+        curve = (
+            "Learning curves on {}: mean and range over seeds (left), interquartile mean and 95 % interval (right). "
+            "Until an offline variant's policy is trained, at the end, its curve is CEM's."
+        )
+        final = "Final rewards: interquartile mean, its 95 % interval, and every run as a stroke."
+        return [
+            *(
+                picture("learning_curves", curve.format(task), learning_curves(study, task, repetitions), task)
+                for task in study.tasks
+            ),
+            picture("final_rewards", final, final_rewards(study, table, repetitions)),
+        ]
+
+    axes = " and ".join(axis_in_words(axis) for axis in study.axes)
+    caption = STABILITY.format("of all configurations and seeds")
+    pictures = [picture("stability", caption, stability(table, study.methods, repetitions))]
+    for task in study.tasks:
+        lines = f"Sensitivity to {axes} on {task}: learning curves, means over seeds."
+        pictures.append(picture("sensitivity", lines, sensitivity(study, task), task))
+        points = f"Final rewards on {task} by {axes}: interquartile means over all runs with a value, and 95 % intervals."
+        pictures.append(picture("values", points, values(study, table, task, repetitions), task))
+    return pictures
+
+
+def task_names(tasks: Sequence[str]) -> dict[str, str]:
+    """
+    Return names of tasks for the files of figures.
+
+    :param tasks: the ids of a study's tasks
+    :return: by id, a name without a slash; that of an id whose name another one has, too, ends with the id's checksum
+    """
+    names = {task: re.sub(r"[^\w.-]+", "_", task) for task in tasks}
+    count = Counter(names.values())
+    return {task: name if count[name] == 1 else f"{name}-{zlib.crc32(task.encode()):08x}" for task, name in names.items()}
+
+
+def stability_together(studies: Sequence[Study], repetitions: int = REPETITIONS) -> list[Picture]:
+    """
+    Draw the stability of several sweeps together.
+
+    Sweeps belong together that have two methods in common; a sweep that shares one method answers another question.
+
+    :param studies: the studies
+    :param repetitions: number of bootstrap samples
+    :return: the figure of the largest group of sweeps; none without a group of two
+    """
+    groups: list[list[Study]] = []
+    for study in studies:
+        if study.axes:
+            fitting = [group for group in groups if any(len({*study.methods} & {*other.methods}) >= 2 for other in group)]
+            groups = [group for group in groups if group not in fitting]
+            groups.append([member for group in fitting for member in group] + [study])
+    largest = max(groups, key=len, default=[])
+    if len(largest) < 2:
+        return []
+    methods = list(dict.fromkeys(method for study in largest for method in study.methods))
+    caption = STABILITY.format(f"of all sweeps ({', '.join(study.name for study in largest)}) that name the method")
+    return [Picture(f"{FIGURES}/stability.png", caption, stability(score_table(largest), methods, repetitions))]

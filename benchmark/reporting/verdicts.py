@@ -1,0 +1,72 @@
+"""Verdicts on claims: a claim rests on comparisons, each of which is judged by its interval."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmark.reporting.estimates import FEWEST_RUNS, Estimate
+
+# The method that the claims are about
+OURS = "CGP-Online"
+SUPPORTED, CONTRADICTED = "supported", "contradicted"
+NOT_DECIDED, NO_DATA = "not decided by these data", "no data"
+
+
+@dataclass(frozen=True)
+class Part:
+    """
+    One comparison that a claim rests on.
+
+    :param text: the comparison and its result
+    :param verdict: the verdict on the claim
+    """
+
+    text: str
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Finding:
+    """
+    The finding on a claim.
+
+    :param claim: the paper's claim
+    :param parts: the comparisons that it rests on; none without data
+    """
+
+    claim: str
+    parts: list[Part]
+
+    @property
+    def verdict(self) -> str:
+        """The verdict of all parts together."""
+        verdicts = [part.verdict for part in self.parts]
+        if not verdicts:
+            return NO_DATA
+        if CONTRADICTED in verdicts:
+            return CONTRADICTED
+        return SUPPORTED if set(verdicts) == {SUPPORTED} else NOT_DECIDED
+
+    @property
+    def text(self) -> str:
+        """The text of all parts, each with its verdict if there are several."""
+        if len(self.parts) == 1:
+            return self.parts[0].text
+        return "; ".join(f"{part.text}: {part.verdict}" for part in self.parts)
+
+
+def judge(found: Estimate, more_than: float = -np.inf, less_than: float = np.inf) -> str:
+    """
+    Compare an interval with the bounds of a claim.
+
+    :param found: the estimate
+    :param more_than: the lower bound
+    :param less_than: the upper bound
+    :return: the verdict
+    """
+    if found.interval is None or found.runs < FEWEST_RUNS:
+        return NOT_DECIDED
+    low, high = found.interval
+    if low > more_than and high < less_than:
+        return SUPPORTED
+    return CONTRADICTED if high < more_than or low > less_than else NOT_DECIDED

@@ -1,0 +1,59 @@
+"""The table of CEM calls in Markdown, with the notes on it."""
+
+from typing import Any
+
+from benchmark.common.provenance import conditions_in_words
+from benchmark.common.tables import markdown_table
+from benchmark.speed.products import Sizes
+
+NOTES = """\
+Milliseconds of one CEM call on a Q-network with {n_features} features, two hidden layers and ReLU: medians of {rounds}
+calls, everything in the table taken in turn; one size is varied at a time around the first lines'. "/ plain" is the ratio
+to the same call with the observation repeated for every sample in float32; "of products" the time of the bare products
+over the call's. Both are medians of the ratios within each round.
+
+The bare products are all the critic's: hidden activations, (batch × samples, width), by the second layer's weights,
+(width, width), once per iteration and in the same data type; and in float32 the first layer's parts for states (once)
+and actions, and the last layer. Operands lie ready and no activation is applied. For the hidden ones the fastest of
+PyTorch's kernels counts, in one piece and in blocks of several sizes; "of hidden" is their share alone. GFLOP/s counts the
+same products."""
+
+
+def markdown(record: dict[str, Any]) -> str:
+    """
+    Write the table.
+
+    :param record: the measurements and their conditions
+    :return: the table and its notes, in Markdown
+    """
+    header = [
+        "batch × samples × iterations",
+        "actions",
+        "width",
+        "type",
+        "ms",
+        "plain",
+        "/ plain",
+        "GFLOP/s",
+        "of products",
+        "of hidden",
+    ]
+    rows = []
+    for entry in record["calls"]:
+        sizes = entry["sizes"]
+        rows.append(
+            [
+                f"{sizes['batch']} × {sizes['samples']} × {sizes['iterations']}",
+                str(sizes["action_dim"]),
+                str(sizes["width"]),
+                entry["dtype"],
+                f"{1e3 * entry['call_seconds']['median']:.3g}",
+                f"{1e3 * entry['plain_seconds']['median']:.3g}",
+                f"{entry['ratio_to_plain']:.2f}",
+                f"{entry['flops_per_second'] / 1e9:.3g}",
+                f"{entry['share_of_products']:.0%}",
+                f"{entry['share_of_hidden_products']:.0%}",
+            ]
+        )
+    notes = NOTES.format(n_features=Sizes().n_features, rounds=record["rounds"])
+    return "\n\n".join(["# One CEM call", markdown_table(header, rows), notes, conditions_in_words(record)]) + "\n"

@@ -1,0 +1,74 @@
+"""Runs that train with CEM in float32 or in bfloat16, a record of each."""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from benchmark.common.files import file_name, write_json
+from benchmark.common.provenance import conditions
+from benchmark.common.records import EVALUATION_SEED
+from benchmark.speed.elites import critic_overlaps
+from benchmark.speed.training import train_by_zoo
+
+DTYPES = ("float32", "bfloat16")
+EPISODES = 20
+
+
+def run(env_id: str, dtype: str, seed: int, args: argparse.Namespace, argv: Sequence[str]) -> dict[str, Any]:
+    """
+    Train and evaluate once.
+
+    :param env_id: the environment
+    :param dtype: ``cem_dtype``
+    :param seed: the seed
+    :param args: the command line
+    :param argv: its arguments, for the record
+    :return: the record
+    """
+    hyperparams = {"cem_dtype": dtype} | ({} if args.steps is None else {"n_timesteps": args.steps})
+    model = train_by_zoo(env_id, hyperparams, seed, args.device)
+    env = make_vec_env(env_id, seed=EVALUATION_SEED)
+    returns, _ = evaluate_policy(model, env, EPISODES, return_episode_rewards=True)
+    record = {
+        **conditions("benchmark.precision", argv, model.device),
+        "env": env_id,
+        "dtype": dtype,
+        "seed": seed,
+        "steps": model.num_timesteps,
+        "returns": returns,
+    }
+    if dtype == "float32":
+        networks = {"critic": model.critic, "target critic": model.critic_target}
+        record["overlaps"] = {name: critic_overlaps(model, network) for name, network in networks.items()}
+    return record
+
+
+def read_records(folder: Path) -> list[dict[str, Any]]:
+    """
+    Read the records of finished runs.
+
+    :param folder: the folder of the records
+    :return: the records, by task, data type and seed
+    """
+    records = [json.loads(path.read_text()) for path in folder.glob("*_seed*.json")]
+    return sorted(records, key=lambda record: (record["env"], record["dtype"], record["seed"]))
+
+
+def train_missing(args: argparse.Namespace, argv: Sequence[str]) -> None:
+    """
+    Train the runs that have no record yet.
+
+    :param args: the command line
+    :param argv: its arguments, for the records
+    """
+    for env_id in args.envs:
+        for seed in args.seeds:
+            for dtype in DTYPES:
+                path = args.folder / f"{file_name(env_id)}_{dtype}_seed{seed}.json"
+                if not path.exists():
+                    write_json(path, run(env_id, dtype, seed, args, argv))

@@ -1,0 +1,112 @@
+"""Checks of values before the first run starts: each configuration has to become a model."""
+
+import argparse
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import optuna
+import yaml
+from optuna.samplers import RandomSampler
+from rl_zoo3 import ALGOS
+from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from benchmark.common.zoo import silence
+from benchmark.sweeps.experiments import Sweep
+from benchmark.sweeps.hyperparameters import problems
+from benchmark.sweeps.runs import Run
+from benchmark.sweeps.tuning import Tuning
+from benchmark.sweeps.validation import SweepError
+
+# A replay buffer that is only constructed needs no more memory than this
+LARGEST_BUFFER = 10_000
+# Configurations of a tuning, of which one has to become a model
+N_SAMPLES = 10
+
+
+def check_values(sweep: Sweep) -> None:
+    """
+    Construct a model of each configuration, as values may be wrong that have the right names and types.
+
+    :param sweep: the sweep
+    :raises SweepError: if a model cannot be constructed; it names the sweep's file, the configuration and the error
+    """
+    for run in _representatives(sweep):
+        try:
+            construct(run)
+        except Exception as error:
+            place = f"{run.configuration} on {run.task}"
+            raise SweepError(sweep.path or sweep.name, place, f"no model can be made: {_in_words(error)}") from error
+
+
+def check_tuning(tuning: Tuning) -> None:
+    """
+    Check that some sampled configuration becomes a model, with the task's entry and the hyperparameters that are fixed.
+
+    :param tuning: the tuning
+    :raises SweepError: if none of several does; it names the first one's error
+    """
+    study = optuna.create_study(sampler=RandomSampler(seed=0))
+    first: Exception | None = None
+    for _ in range(N_SAMPLES):
+        trial = study.ask()
+        tuning.sample(trial)
+        run = tuning.run(study.trials[trial.number], seed=0)
+        hyperparams = {name: value for name, value in run.hyperparams.items() if name != "n_timesteps"}
+        for key, problem in problems("the tuned method", run.algo, hyperparams):
+            raise SweepError("The tuned configurations", key, problem)
+        try:
+            return construct(run)
+        except Exception as error:
+            first = first or error
+    assert first is not None
+    raise SweepError("The tuned configurations", "", f"no model can be made: {_in_words(first)}") from first
+
+
+def _in_words(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def _representatives(sweep: Sweep) -> Iterator[Run]:
+    """List a run of each configuration on the first task, and a run of each method on all other tasks."""
+    seen: set[tuple[str, str]] = set()
+    for run in sweep.runs():
+        part = run.configuration if run.task == sweep.file.tasks[0] else run.method
+        if (run.task, part) not in seen:
+            seen.add((run.task, part))
+            yield run
+
+
+def construct(run: Run) -> None:
+    """
+    Construct the model of a run as rl_zoo3 does, without training it.
+
+    :param run: the run, whose environment is registered
+    :raises Exception: all errors of the environment and the algorithm
+    """
+    hyperparams: dict[str, Any] = {"n_timesteps": run.steps, **run.hyperparams}
+    if issubclass(ALGOS[run.algo], OffPolicyAlgorithm) and isinstance(hyperparams.get("buffer_size", 0), int):
+        hyperparams["buffer_size"] = min(hyperparams.get("buffer_size", LARGEST_BUFFER), LARGEST_BUFFER)
+    with TemporaryDirectory() as folder, silence(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        conf_file = Path(folder) / "hyperparams.yml"
+        conf_file.write_text(yaml.safe_dump({run.task: hyperparams}))
+        manager = ExperimentManager(
+            argparse.Namespace(),
+            run.algo,
+            run.task,
+            folder,
+            n_timesteps=run.steps,
+            eval_freq=-1,
+            hyperparams=hyperparams if run.tuned else None,
+            config=None if run.tuned else str(conf_file),
+            seed=run.seed,
+            verbose=0,
+            device="cpu",
+        )
+        model, _ = manager.setup_experiment()  # type: ignore[misc]
+        assert model.env is not None
+        model.env.close()

@@ -1,0 +1,81 @@
+"""The runs of a sweep, and their description."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from benchmark.common.records import configuration_in_words, run_key
+from benchmark.sweeps.sweep_files import Hyperparams
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    One configuration with one seed.
+
+    :param method: the method's name
+    :param task: the environment, as it is registered
+    :param settings: the values of the axes
+    :param seed: the seed
+    :param algo: the algorithm's name in rl_zoo3
+    :param hyperparams: hyperparameters, as in rl_zoo3's YAML files
+    :param tuned: whether they come on top of those of the algorithm's YAML file
+    :param steps: environment steps
+    :param evaluation_interval: environment steps between two evaluations
+    :param evaluation_episodes: episodes of each evaluation
+    :param checkpoint_interval: environment steps between two saved training states
+    :param gym_packages: modules to import, which register the environment
+    """
+
+    method: str
+    task: str
+    settings: dict[str, Any]
+    seed: int
+    algo: str
+    hyperparams: Hyperparams
+    tuned: bool
+    steps: int
+    evaluation_interval: int
+    evaluation_episodes: int
+    checkpoint_interval: int
+    gym_packages: list[str] = field(default_factory=list)
+
+    @property
+    def configuration(self) -> str:
+        """The method and the values of the axes, as text."""
+        return configuration_in_words(self.method, self.settings)
+
+    @property
+    def key(self) -> str:
+        """A text that no other run of its study has."""
+        return run_key(self.method, self.settings, self.task, self.seed)
+
+
+def overview(runs: Iterable[Run], methods: Iterable[str], tasks: Iterable[str]) -> dict[str, Any]:
+    """
+    Describe the runs of a sweep.
+
+    :param runs: the runs, some perhaps more than once
+    :param methods: all methods of the sweep, in order
+    :param tasks: all environments of the sweep, in order
+    :return: the methods, tasks and seeds of the runs, their number, and the hyperparameters of each configuration
+    """
+    by_key = {run.key: run for run in runs}
+    ordered = sorted(by_key.values(), key=lambda run: run.configuration)
+    return {
+        "methods": [method for method in methods if any(run.method == method for run in ordered)],
+        "tasks": [task for task in tasks if any(run.task == task for run in ordered)],
+        "seeds": sorted({run.seed for run in ordered}),
+        "runs_planned": len(ordered),
+        "configurations": {run.configuration: {"algo": run.algo, **run.hyperparams} for run in ordered},
+    }
+
+
+def checkpoint_interval(steps: int) -> int:
+    """
+    Return the default interval between two saved training states.
+
+    :param steps: environment steps of a run
+    :return: a tenth of the run, from 1,000 to 10,000 environment steps
+    """
+    return min(max(steps // 10, 1_000), 10_000)

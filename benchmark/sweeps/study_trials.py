@@ -1,0 +1,137 @@
+"""The trials of a study: the attributes that describe a run, and the rule which of a run's trials is its own."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
+from optuna.trial import FrozenTrial, TrialState
+
+from benchmark.common.records import Record
+from benchmark.sweeps.experiments import Sweep
+from benchmark.sweeps.heartbeats import PROGRESS
+from benchmark.sweeps.runs import Run
+
+# Attributes of a study: its description, and the prefix of those that each record a command that trained runs
+SWEEP, COMMAND = "sweep", "command "
+# Attributes of a trial
+RUN, KEY, ERROR, WORKER, OUTCOME = "run", "key", "error", "worker", "outcome"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """
+    A run that this process has taken.
+
+    :param trial_id: the trial
+    :param run: the run
+    """
+
+    trial_id: int
+    run: Run
+
+
+def is_open_or_ended(trial: FrozenTrial) -> bool:
+    """
+    Return whether a run with this trial needs no other trial.
+
+    :param trial: the trial
+    :return: whether it waits, runs, is completed, or has failed with an error
+    """
+    return trial.state is not TrialState.FAIL or ERROR in trial.user_attrs
+
+
+def owned(trials: Iterable[FrozenTrial]) -> dict[str, FrozenTrial]:
+    """
+    Return the trial of each run.
+
+    :param trials: the study's trials
+    :return: by the run's key, its first trial for which :func:`is_open_or_ended` is true
+    """
+    owners: dict[str, FrozenTrial] = {}
+    for trial in sorted(trials, key=lambda trial: trial.number):
+        if is_open_or_ended(trial):
+            owners.setdefault(trial.user_attrs[KEY], trial)
+    return owners
+
+
+def attributes_of(run: Run) -> dict[str, Any]:
+    """
+    Return the attributes of a run's trials.
+
+    :param run: the run
+    :return: its key, and all of its fields
+    """
+    return {KEY: run.key, RUN: asdict(run)}
+
+
+def seconds_of(trial: FrozenTrial) -> float:
+    """
+    Return the wall-clock time of a trial.
+
+    :param trial: the trial
+    :return: seconds, as its last heartbeat reported them
+    """
+    return trial.user_attrs.get(PROGRESS, {}).get("seconds", 0.0)
+
+
+def params_of(run: Run) -> dict[str, Any]:
+    """
+    Return Optuna's parameters of a run.
+
+    :param run: the run
+    :return: method, task, the values of the axes, and seed
+    """
+    return {"method": run.method, "task": run.task, **run.settings, "seed": run.seed}
+
+
+def distributions_of(sweep: Sweep) -> dict[str, BaseDistribution]:
+    """
+    Return Optuna's distributions of the parameters of a sweep's runs.
+
+    :param sweep: the sweep
+    :return: distribution by parameter; those of the file, as a later command may add methods, and any seed
+    """
+    choices: dict[str, list[Any]] = {"method": list(sweep.file.methods), "task": sweep.file.tasks}
+    choices |= {name: list(axis.values) for name, axis in sweep.file.axes.items()}
+    return {
+        **{name: CategoricalDistribution(values) for name, values in choices.items()},
+        "seed": IntDistribution(0, 2**32 - 1),
+    }
+
+
+def choices_of(trials: Sequence[FrozenTrial], name: str) -> list[Any]:
+    """
+    Return the values that a parameter can have in a study.
+
+    :param trials: the study's trials
+    :param name: the parameter
+    :return: the values; none without a trial
+    """
+    distribution = trials[0].distributions[name] if trials else None
+    return list(distribution.choices) if isinstance(distribution, CategoricalDistribution) else []
+
+
+def record_of(experiment: str, trial: FrozenTrial, seconds: float) -> Record:
+    """
+    Return the record of a run that has ended.
+
+    :param experiment: the sweep's name
+    :param trial: the run's own trial
+    :param seconds: wall-clock time of all its trials together
+    :return: the record
+    """
+    run, points = trial.user_attrs[RUN], sorted(trial.intermediate_values.items())
+    return Record(
+        experiment,
+        run["method"],
+        run["task"],
+        run["settings"],
+        run["seed"],
+        run["steps"],
+        [step for step, _ in points],
+        [value for _, value in points],
+        trial.value if trial.state is TrialState.COMPLETE else None,
+        trial.user_attrs.get(ERROR),
+        seconds,
+    )
