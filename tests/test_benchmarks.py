@@ -20,10 +20,10 @@ from benchmark import checkpoint, latency, runtime, scaling, selector
 from benchmark.common import arguments
 from benchmark.speed import cem_calls, checkpoints, contenders, latencies, products, run_times, scaling_points
 from benchmark.speed.boxes import BoxEnv
-from benchmark.speed.plain import PlainPolicy
 from benchmark.speed.products import Sizes
 from benchmark.speed.timing import interleaved, ratio, summary, timed
 from sb3_cgp import CGP
+from sb3_cgp.core.policies import CGPPolicy as PlainPolicy
 from sb3_cgp.core.policies import repeated_q_score
 
 CPU = th.device("cpu")

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from benchmark.speed.plain import PlainPolicy
+from sb3_cgp.core.policies import CGPPolicy as PlainPolicy
 
 BATCH_SIZE = 128
 NET_ARCH = [256, 256]
