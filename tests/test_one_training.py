@@ -11,10 +11,12 @@ import textwrap
 import numpy as np
 import pytest
 import torch as th
+from environments import Doubles
 from stable_baselines3 import TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
 from test_callbacks import make_model
 from trainings import Do, Interruption, Stop
 
@@ -22,6 +24,7 @@ from sb3_cgp import CGP
 from sb3_cgp.common.files import write_atomically
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer
 from sb3_cgp.resumption import FolderInUseError, TrainingCheckpointCallback, resumable
+from sb3_cgp.resumption.environments import obstacles
 from sb3_cgp.resumption.replay_buffers import fill_replay_buffer, replay_buffer_state
 
 IN_USE = r"in use by another training: process \d+ on host "
@@ -179,3 +182,42 @@ def test_what_cannot_be_restored_is_said_at_the_first_state_with_all_obstacles(t
     assert "PendulumEnv.first" in messages[0]
     assert "PendulumEnv.second" in messages[0]
     assert "EvalCallback's `eval_env`" in messages[1]
+
+
+class Settling(resumable(TD3)):
+    """A model that brings its attributes and its log up to date when its state is asked for."""
+
+    settled, restored = 0, None
+
+    def get_training_state(self):
+        self.settled = self.num_timesteps
+        self.logger.record("settled", self.num_timesteps)
+        return super().get_training_state() | {"value": self.num_timesteps}
+
+    def set_training_state(self, state):
+        super().set_training_state(state)
+        self.restored = state["value"]
+
+
+def test_a_models_own_state_is_taken_before_its_attributes_and_its_log(tmp_path, monkeypatch):
+    arguments = dict(learning_starts=5, policy_kwargs=dict(net_arch=[4]), buffer_size=50)
+    monkeypatch.chdir(tmp_path)
+    elsewhere = Do(3, lambda: monkeypatch.chdir("/"))
+    Settling("MlpPolicy", env(), **arguments).learn(10, [TrainingCheckpointCallback(10, "state"), elsewhere])
+    model = Settling.resume(tmp_path / "state", env())
+    assert model.settled == 10
+    assert model.resumption["logger"]["name_to_value"]["settled"] == 10
+    model.learn(10)
+    assert model.restored == 10
+
+
+@pytest.mark.parametrize(
+    ("task", "message"), [("Pendulum-v1", "RestorableEnv its outermost"), (Doubles, "RestorableEnv alone would not help")]
+)
+def test_what_would_help_environments_in_other_processes(task, message):
+    processes = make_vec_env(task, vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))
+    try:
+        (problem,) = obstacles(processes)
+    finally:
+        processes.close()
+    assert message in problem
