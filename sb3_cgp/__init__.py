@@ -5,8 +5,7 @@ from sb3_cgp.common.version import __version__
 from sb3_cgp.core.cem import CEM, ActionSelector, Selection
 from sb3_cgp.export.policy import ExportedPolicy
 from sb3_cgp.fast.policies import CGPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
-from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
-from sb3_cgp.resumption.environments import RestorableEnv
+from sb3_cgp.resumption import RestorableEnv, TrainingCheckpointCallback
 
 __all__ = [
     "CEM",

@@ -214,7 +214,7 @@ class CGP(ResumableAlgorithm, DiagnosticsAlgorithm, CudaGraphAlgorithm, GuardedA
         :raises ValueError: if there is no policy loss or no data, if observations are not normalised and the critics have
             learnt from normalised ones, or if a loss is NaN or infinite
         """
-        with self._explaining_errors():
+        with self.as_training(), self._explaining_errors():
             self._check_normalisation()
             return super().train_policy(max_steps, batch_size, callback, progress_bar)
 

@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from trainings import SMALL, Do
 
 from sb3_cgp import CGP
-from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
+from sb3_cgp.resumption import TrainingCheckpointCallback
 from sb3_cgp.resumption.store import StateStore
 
 

@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 
 from sb3_cgp.common.files import write_atomically
+from sb3_cgp.resumption import encoding
 from sb3_cgp.resumption import store as store_module
 from sb3_cgp.resumption.store import BLOCK_FOLDERS, StateStore
 
@@ -99,7 +100,7 @@ def test_what_is_not_data_is_refused_by_its_place(tmp_path, state, message):
 
 
 def test_only_what_has_changed_of_a_large_array_is_written(tmp_path, monkeypatch):
-    monkeypatch.setattr(store_module, "BLOCK_BYTES", 2**16)
+    monkeypatch.setattr(encoding, "BLOCK_BYTES", 2**16)
     written = []
 
     def write(path, content):
@@ -242,7 +243,7 @@ def test_a_manifest_reaches_nothing_outside_of_its_folder(tmp_path, monkeypatch,
     StateStore(tmp_path).save(1, state_of(1))
     body = StateStore(tmp_path)._read_manifest(1)
     text = json.dumps(body)
-    digest = next(iter(store_module._digests(body["state"])))
+    digest = next(iter(encoding.iter_digests(body["state"])))
     content = text.replace(digest, name)
     checksum = hashlib.sha256(content.encode()).hexdigest()
     (tmp_path / "state-000000000001.json").write_text(f'{{"sha256": "{checksum}", "body": {content}}}\n')

@@ -11,7 +11,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_cgp import CGP
-from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
+from sb3_cgp.resumption import TrainingCheckpointCallback
 
 SMALL = dict(learning_starts=20, buffer_size=150, batch_size=8, cem_samples=8, cem_elites=2, seed=0, device="cpu")
 

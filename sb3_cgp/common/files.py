@@ -1,25 +1,30 @@
-"""Writing files: beside their place, onto the disk, and only then in their place."""
+"""Write files as a whole: first under another name, then onto the disk, and only then under their own name."""
 
 import errno
 import os
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-# What files are called until they are whole
+# The prefix of the names of files that are not complete yet
 PARTIAL = ".partial-"
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[BinaryIO]:
     """
-    Write a file so that whoever looks sees the old one or the new one, never a part, and after a crash too.
+    Write a file so that readers see the old or the new content, never a part of it, also after a crash.
+
+    Through a symbolic link, the file that it points to is written. A file that exists keeps its permissions.
 
     :param path: the file; its folder is made if it is missing
-    :return: where to write, which takes its place at the end unless there was an error
+    :return: the file to write to, which replaces the old one at the end unless there was an error
     :raises OSError: if it cannot be written, as on a full disk; it names the file, and the old one is still there
     """
+    # `os.replace` would replace a link itself
+    path, given = Path(os.path.realpath(path)), path
     beside = _beside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -27,9 +32,10 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
+        _keep_mode(path, beside)
         os.replace(beside, path)
     except OSError as error:
-        raise _not_written(error, path) from error
+        raise _not_written(error, given) from error
     finally:
         _remove(beside)
     sync_folder(path.parent)
@@ -40,7 +46,7 @@ def write_atomically(path: Path, content: bytes | memoryview) -> None:
     Write a file as :func:`whole_file` does.
 
     :param path: the file
-    :param content: what it shall hold
+    :param content: the content
     :raises OSError: if it cannot be written; it names the file, and the old one is still there
     """
     with whole_file(path) as file:
@@ -51,15 +57,16 @@ def replace_all(folder: Path, contents: Mapping[str, bytes | memoryview]) -> Non
     """
     Write files of one folder, each of which appears as a whole.
 
-    All are on the disk before the first takes its place, in their order: let the last one hold the others' checksums, and
-    what a crash among the renamings leaves is recognised as a mix.
+    All are on the disk before the first is renamed, and they are renamed in order. If the last one holds the checksums of the
+    others, a mix of old and new files, which a crash between two renamings leaves, can be recognised.
 
     :param folder: the folder; it is made if it is missing
     :param contents: the files' contents by name
     :raises OSError: if one cannot be written; it names the file, and the old ones are still there
     """
     folder.mkdir(parents=True, exist_ok=True)
-    beside = {name: _beside(folder / name) for name in contents}
+    paths = {name: Path(os.path.realpath(folder / name)) for name in contents}
+    beside = {name: _beside(path) for name, path in paths.items()}
     name = ""
     try:
         for name, content in contents.items():
@@ -68,7 +75,8 @@ def replace_all(folder: Path, contents: Mapping[str, bytes | memoryview]) -> Non
                 file.flush()
                 os.fsync(file.fileno())
         for name, path in beside.items():
-            os.replace(path, folder / name)
+            _keep_mode(paths[name], path)
+            os.replace(path, paths[name])
     except OSError as error:
         raise _not_written(error, folder / name) from error
     finally:
@@ -81,8 +89,14 @@ def _beside(path: Path) -> Path:
     return path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
 
 
+def _keep_mode(path: Path, beside: Path) -> None:
+    # A file system without permissions is no reason to write nothing
+    with suppress(OSError):
+        os.chmod(beside, stat.S_IMODE(path.stat().st_mode))
+
+
 def _remove(path: Path) -> None:
-    # What is left over may not be there, and cannot hide why
+    # The file may not exist, and an error here must not hide the cause
     with suppress(OSError):
         path.unlink()
 
@@ -93,11 +107,11 @@ def _not_written(error: OSError, path: Path) -> OSError:
 
 def sync_folder(folder: Path) -> None:
     """
-    Put the names in a folder onto the disk.
+    Write the names of a folder's files to the disk.
 
     :param folder: the folder
     """
-    # Windows opens no folders, nor does it need to
+    # Windows can open no folders, and need not
     if os.name == "posix":
         descriptor = os.open(folder, os.O_RDONLY)
         try:

@@ -253,8 +253,8 @@ class CudaGraphAlgorithm(CGP):
         :raises ValueError: if a loss was NaN or infinite in a recorded gradient step
         """
         self._report()
-        parent = getattr(super(), "get_training_state", dict)
-        return parent()
+        inherited = getattr(super(), "get_training_state", dict)
+        return inherited()
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name not in TRANSIENT}

@@ -68,6 +68,8 @@ class DeviceReplayBuffer(ReplayBuffer):
     :raises ValueError: if ``optimize_memory_usage`` is set or the observation space is not a ``Box``
     """
 
+    # The fields that a training state holds
+    row_fields = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
     observations = _stored("observations")
     next_observations = _stored("next_observations")
     actions = _stored("actions")

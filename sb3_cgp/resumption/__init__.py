@@ -1,1 +1,8 @@
-"""Resuming a stopped training, to the bit, for any of SB3's off-policy algorithms."""
+"""Resume an interrupted training of any of SB3's off-policy algorithms, to the bit."""
+
+from sb3_cgp.resumption.algorithm import ResumableAlgorithm, resumable
+from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
+from sb3_cgp.resumption.environments import RestorableEnv
+from sb3_cgp.resumption.locks import FolderInUseError
+
+__all__ = ["FolderInUseError", "RestorableEnv", "ResumableAlgorithm", "TrainingCheckpointCallback", "resumable"]

@@ -1,4 +1,4 @@
-"""Algorithms whose training can be stopped anywhere, by whatever, and go on as if it had not been."""
+"""Off-policy algorithms whose training can be interrupted at any time and resumed."""
 
 import copy
 import io
@@ -10,16 +10,19 @@ from typing import Any, TypeVar
 
 import torch as th
 from stable_baselines3.common.base_class import maybe_make_env
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_cgp.common.files import whole_file
 from sb3_cgp.common.rules import require
+from sb3_cgp.resumption.callback_states import iter_callbacks
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
+from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.logs import continued_logger
-from sb3_cgp.resumption.state import State, begin_new_episode, fill_replay_buffer, walk
+from sb3_cgp.resumption.model import ResumableModel
+from sb3_cgp.resumption.replay_buffers import fill_replay_buffer
+from sb3_cgp.resumption.state import begin_new_episode, check_fits
 from sb3_cgp.resumption.store import StateStore
 
 SelfResumableAlgorithm = TypeVar("SelfResumableAlgorithm", bound="ResumableAlgorithm")
@@ -27,7 +30,7 @@ SelfResumableAlgorithm = TypeVar("SelfResumableAlgorithm", bound="ResumableAlgor
 
 @contextmanager
 def _whole(path: str | Path | io.BufferedIOBase, suffix: str) -> Iterator[Any]:
-    """Open a file to be written as a whole, named as SB3 names it; what is open already is left to whoever opened it."""
+    """Open a file to be written as a whole, named as SB3 names it. A file that is open already is yielded as it is."""
     if isinstance(path, io.BufferedIOBase):
         yield path
         return
@@ -36,25 +39,12 @@ def _whole(path: str | Path | io.BufferedIOBase, suffix: str) -> Iterator[Any]:
         yield file
 
 
-class ResumableAlgorithm(OffPolicyAlgorithm):
+class ResumableAlgorithm(ResumableModel):
     """
-    An algorithm that goes on from the states that a :class:`~sb3_cgp.resumption.callbacks.TrainingCheckpointCallback` saves.
+    An algorithm that resumes from the states of a :class:`~sb3_cgp.resumption.callbacks.TrainingCheckpointCallback`.
 
-    It comes first among an algorithm's bases: :func:`resumable` makes one of any of SB3's off-policy algorithms.
+    It comes first among an algorithm's bases. :func:`resumable` makes one of any of SB3's off-policy algorithms.
     """
-
-    # The training's callbacks
-    callback: BaseCallback
-    # What is to be restored when the training goes on
-    resumption: State | None = None
-    # The folders that this training's states are in
-    saved_to: frozenset[Path] = frozenset()
-    # Environment steps when the training started that is going on, or was interrupted
-    _training_started_at: int = 0
-    # Whether the critics have learnt since the policy was last trained offline
-    _policy_is_due: bool = False
-    # Whether this is the policy's offline training
-    is_training_policy: bool = False
 
     @classmethod
     def resume(
@@ -65,37 +55,57 @@ class ResumableAlgorithm(OffPolicyAlgorithm):
         **kwargs: Any,
     ) -> SelfResumableAlgorithm:
         """
-        Load the newest undamaged state of a training that was interrupted.
+        Load the newest undamaged state of an interrupted training.
 
-        The model's next ``learn`` goes on with that training: give it the arguments that it had at first. Its
-        ``total_timesteps`` means what it meant, so that the training ends where it would have ended. Without a
-        ``TrainingCheckpointCallback`` among its callbacks, states go on being saved as before.
+        The model's next ``learn`` continues that training: give it the arguments of the first call. Its ``total_timesteps``
+        counts from the training's start, so that the training ends where it would have ended. Without a
+        ``TrainingCheckpointCallback`` among its callbacks, states are saved as before. Until ``learn`` ends or the model is
+        deleted, no other training can use the folder.
 
         The state holds SB3's zip, which is unpickled and can run code, as with :meth:`load`: resume your own trainings only.
 
         :param path: the folder of the states
-        :param env: the environment, made as at first (if registered in Gym, can be str); its state is restored when
+        :param env: the environment, made as for the first call (if registered in Gym, can be str); its state is restored when
             ``learn`` starts
         :param device: Device on which the code should run.
         :param kwargs: arguments to change in the model, see :meth:`load`
         :return: the model
         :raises FileNotFoundError: if the folder holds no state
         :raises ValueError: if all states are damaged, naming the files, or if the environment or an argument does not fit
+        :raises FolderInUseError: if another training uses the folder, naming its host and process
         """
-        _, state = StateStore(path).load()
-        require(state["algorithm"] == cls.__name__, "path", str(path), f"of {cls.__name__}, not {state['algorithm']}")
-        model = cls.load(io.BytesIO(state.pop("model")), maybe_make_env(env, 0), device, force_reset=False, **kwargs)
+        store = StateStore(Path(path).resolve())
+        lock = FolderLock(store.folder)
+        if store.steps():
+            lock.acquire()
+        try:
+            model = cls._load_state(store, maybe_make_env(env, 0), device, **kwargs)
+        except BaseException:
+            lock.release()
+            raise
+        model._folder_locks = {store.folder: lock}
+        return model
+
+    @classmethod
+    def _load_state(
+        cls: type[SelfResumableAlgorithm], store: StateStore, env: GymEnv | None, device: th.device | str, **kwargs: Any
+    ) -> SelfResumableAlgorithm:
+        """Load the newest undamaged state of a locked folder."""
+        digests = store.digests()
+        _, state = store.load()
+        require(state["algorithm"] == cls.__name__, "path", str(store.folder), f"of {cls.__name__}, not {state['algorithm']}")
+        model = cls.load(io.BytesIO(state.pop("model")), env, device, force_reset=False, **kwargs)
         assert model.env is not None
-        require(model.n_envs == state["n_envs"], "env.num_envs", model.n_envs, f"{state['n_envs']}, as was saved")
+        check_fits(model, state)
         # The same object, as at first: environments may draw from it, too
         model.action_space = model.env.action_space
         fill_replay_buffer(model._ensure_replay_buffer(), state.pop("replay_buffer"))
         model.resumption = state | {
-            "checkpoint": state["checkpoint"] | {"path": path},
+            "checkpoint": state["checkpoint"] | {"path": store.folder},
             # `set_env` would forget them
             "last": {name: getattr(model, name) for name in ("_last_obs", "_last_episode_starts", "_last_original_obs")},
         }
-        model.saved_to = frozenset({Path(path).resolve()})
+        model.saved_to = {store.folder: digests}
         return model
 
     def save(
@@ -144,7 +154,7 @@ class ResumableAlgorithm(OffPolicyAlgorithm):
         action_noise = copy.deepcopy(self.action_noise)
         has_logger, folder = self._custom_logger, self.resumption["log_folder"]
         if not has_logger and self.tensorboard_log is not None and folder is not None and os.path.isdir(folder):
-            # SB3's would be the newest run's
+            # SB3 would choose the folder of the newest run
             self.set_logger(continued_logger(folder, self.num_timesteps + 1, self.verbose))
         steps_left = self._training_started_at + total_timesteps - self.num_timesteps
         result = super()._setup_learn(steps_left, callback, False, *args, **kwargs)
@@ -153,7 +163,7 @@ class ResumableAlgorithm(OffPolicyAlgorithm):
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         callback = super()._init_callback(callback, progress_bar)
-        checkpoints = [each for each in walk(callback) if isinstance(each, TrainingCheckpointCallback)]
+        checkpoints = [each for each in iter_callbacks(callback) if isinstance(each, TrainingCheckpointCallback)]
         for each in checkpoints:
             allowed = "None: give a TrainingCheckpointCallback to `learn` itself, as others do not tell it when a step is over"
             require(each.parent is None, "parent", each.parent, allowed)
@@ -163,43 +173,50 @@ class ResumableAlgorithm(OffPolicyAlgorithm):
         self.callback = callback
         return callback
 
-    def _ensure_replay_buffer(self) -> ReplayBuffer:
-        """Find the replay buffer, which SB3's algorithms allocate when they are made or loaded."""
-        ensure = getattr(super(), "_ensure_replay_buffer", None)
-        if ensure is not None:
-            return ensure()
-        assert self.replay_buffer is not None
-        return self.replay_buffer
-
     def learn(self: SelfResumableAlgorithm, *args: Any, **kwargs: Any) -> SelfResumableAlgorithm:
         """
-        Learn as the algorithm does, or go on with that.
+        Train the model, or resume its interrupted training.
 
         :param args: the algorithm's own arguments
         :param kwargs: the algorithm's own arguments
         :return: the trained model
+        :raises FolderInUseError: if a folder for training states is used by another training
         """
-        try:
+        with self.as_training():
             return super().learn(*args, **kwargs)
+
+    @contextmanager
+    def as_training(self) -> Iterator[None]:
+        """
+        Mark a training, which ends here, by an error or not: signals are handled as before, and folders are released.
+
+        ``learn`` is one. A method that calls callbacks without ``learn`` does so within this context. Trainings may be nested.
+        """
+        self._n_nested_trainings += 1
+        try:
+            yield
         finally:
+            self._n_nested_trainings -= 1
             self._release_signals()
 
     def _release_signals(self) -> None:
-        """Let signals act as they did before the training, however it has ended."""
-        for each in walk(self.callback) if hasattr(self, "callback") else ():
+        """Restore the handling of signals, end the saving of states, and release what belongs to the outermost training."""
+        for each in () if self.callback is None else iter_callbacks(self.callback):
             if isinstance(each, TrainingCheckpointCallback):
                 each.release()
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "callback", "resumption", "saved_to", "is_training_policy"]
+        if self._n_nested_trainings == 0:
+            # A callback holds environments and files, which can often be neither copied nor pickled
+            self.callback = None
+            self._warned_of = frozenset()
+            self.release_folders()
 
 
 def resumable(algorithm: type[OffPolicyAlgorithm]) -> type[ResumableAlgorithm]:
     """
-    Make an off-policy algorithm one whose training can be saved and resumed, and which is the same otherwise.
+    Return a subclass of an off-policy algorithm that adds saving and resuming its training.
 
     :param algorithm: the algorithm, such as SB3's TD3
-    :return: a subclass of its name
+    :return: a subclass of the same name
     """
     if issubclass(algorithm, ResumableAlgorithm):
         return algorithm

@@ -1,42 +1,46 @@
-"""A callback that saves the whole training state, so that a training that was stopped goes on as if it had not been."""
+"""A callback that saves the whole training state, so that an interrupted training can be resumed."""
 
 import os
 import signal
 import threading
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cgp.common.rules import require, require_count
-from sb3_cgp.resumption.state import check_replay_buffer, gather, restore
+from sb3_cgp.resumption.model import ResumableModel
+from sb3_cgp.resumption.replay_buffers import check_replay_buffer
+from sb3_cgp.resumption.state import gather, restore, warn_of_unsaved
 from sb3_cgp.resumption.store import StateStore
-
-if TYPE_CHECKING:
-    from sb3_cgp.resumption.algorithm import ResumableAlgorithm
 
 
 class TrainingCheckpointCallback(BaseCallback):
     """
-    Saves the whole training state every so many steps, and when the training ends, for :meth:`sb3_cgp.CGP.resume`.
+    Save the whole training state periodically, and when the training ends, for :meth:`ResumableAlgorithm.resume`.
 
-    SB3 calls callbacks in the middle of a step. What is due is saved before the next rollout starts, when the step is over.
+    SB3 calls callbacks in the middle of a step. A state that is due is saved before the next rollout starts, when the step is
+    over. At the end of a training without rollouts, such as CGP's offline training of a policy, a state is saved, too.
 
-    On SIGTERM, as a cluster's scheduler sends it, the state is saved as soon as the step is over, and the process exits with
-    status 143 (in offline policy training at once: its start was saved). A second SIGTERM acts as it would without this.
-    Of several such callbacks, the first one does this.
+    On SIGTERM, which a cluster's scheduler sends, the state is saved as soon as the step is over, and the process exits with
+    status 143 (in a training without rollouts at once: the state at its start was saved). A second SIGTERM acts as it would
+    without this callback. Of several such callbacks, the first one handles the signal.
+
+    The folder belongs to one training at a time. It is locked from ``resume``, or the start of ``learn``, to ``learn``'s end.
 
     :param save_freq: environment steps between two states, those of all environments together
-    :param path: the folder for the states. None saves nothing, unless rl_zoo3 is training: the run's folder, then.
+    :param path: the folder for the states. With None, nothing is saved, except in rl_zoo3, where it stands for the
+        run's folder. A relative path is resolved when the callback is constructed.
     :param keep: how many states to keep, the newest ones
     :param verbose: Verbosity level: 0 for no output, 2 for indicating when a state is saved
     :raises ValueError: if an argument is out of its range, or, when the training starts, if the folder holds the states of
-        another one, or the replay buffer cannot be saved
+        another training, or the replay buffer cannot be saved
+    :raises FolderInUseError: when the training starts, if another training uses the folder
     :raises OSError: when the training starts or a state is due, if the folder cannot be written to
     """
 
-    model: "ResumableAlgorithm"
+    model: ResumableModel
 
     def __init__(self, save_freq: int, path: str | Path | None = None, keep: int = 2, verbose: int = 0):
         super().__init__(verbose)
@@ -48,37 +52,47 @@ class TrainingCheckpointCallback(BaseCallback):
         self._saved_at = 0
         self._rollout_is_over = False
         self._is_in_rollouts = False
+        self._has_trained_without_rollouts = False
+        # `learn` may end in the middle of a step, and a training without rollouts follow
+        self._is_within_step = False
         self._previous_handler: Any = None
         self._watching_process = 0
         self._is_asked_to_stop = False
 
     @property
+    def path(self) -> str | Path | None:
+        """The folder for the states, as it was given."""
+        return self._path
+
+    @path.setter
+    def path(self, path: str | Path | None) -> None:
+        self._path = path
+        # Now, as the process may change its working directory
+        self._folder = Path("" if path is None else path).resolve()
+
+    @property
     def has_state(self) -> bool:
-        """Whether there is a state to go on from."""
-        return self.path is not None and len(StateStore(self.path).steps()) > 0
+        """Whether the folder holds a state."""
+        return self.path is not None and len(StateStore(self._folder).steps()) > 0
 
     def _on_training_start(self) -> None:
-        self._is_in_rollouts = self._rollout_is_over = False
+        self._is_in_rollouts = self._rollout_is_over = self._has_trained_without_rollouts = False
         self._saved_at = self.num_timesteps
         if self.path is None:
             return
-        # Offline policy training is a training of its own to callbacks
-        if not self.model.is_training_policy:
-            check_replay_buffer(self.model._ensure_replay_buffer())
-            is_another = self.has_state and self._folder not in self.model.saved_to
-            allowed = "a folder without the states of another training: go on with that by `CGP.resume`, or choose another"
-            require(not is_another, "path", str(self.path), allowed)
-            self._store = StateStore(self._folder, self.keep)
-            self._store.prepare()
+        check_replay_buffer(self.model._ensure_replay_buffer())
+        self._store = StateStore(self._folder, self.keep)
+        self._store.prepare()
+        self.model.hold_folder(self._folder)
+        known = self.model.saved_to.get(self._folder, frozenset())
+        is_another = not self._store.digests() <= known
+        allowed = "a folder without the states of another training: go on with that by `resume`, or choose another"
+        require(not is_another, "path", str(self.path), allowed)
         self._watch_for_termination()
-
-    @property
-    def _folder(self) -> Path:
-        assert self.path is not None
-        return Path(self.path).resolve()
 
     def _on_rollout_start(self) -> None:
         self._is_in_rollouts = True
+        self._is_within_step = False
         self._restore_if_resumed()
         if self.path is None:
             return
@@ -91,42 +105,49 @@ class TrainingCheckpointCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         self._rollout_is_over = False
-        if self._is_asked_to_stop and not self._is_in_rollouts:
-            self._stop()
+        if self._is_in_rollouts:
+            self._is_within_step = True
+        else:
+            self._has_trained_without_rollouts = True
+            if self._is_asked_to_stop:
+                self._stop()
         return True
 
     def _on_rollout_end(self) -> None:
         self._rollout_is_over = True
+        self._is_within_step = False
 
     def _on_training_end(self) -> None:
         self._restore_if_resumed()
         # A callback may have ended the training in the middle of a step; rl_zoo3 calls this twice, and after an error
-        if self.path is not None and self._rollout_is_over:
-            self._rollout_is_over = False
+        is_whole = self._rollout_is_over or (self._has_trained_without_rollouts and not self._is_within_step)
+        self._rollout_is_over = self._has_trained_without_rollouts = False
+        if self.path is not None and is_whole:
             self._save()
-        self.release()
-        # During the last step or its saving; what follows `learn` could take as long as the training
+        self._restore_handler()
+        # SIGTERM came during the last step or its saving: the code after `learn` could take as long as the training
         if self._is_asked_to_stop:
             self._stop()
 
     def get_training_state(self) -> dict[str, int]:
         """
-        Tell what a resumed training's callback goes on counting.
+        Return the counters.
 
-        :return: its counters
+        :return: the counters by name
         """
         return {"n_calls": self.n_calls, "num_timesteps": self.num_timesteps}
 
     def set_training_state(self, state: dict[str, int]) -> None:
         """
-        Go on counting.
+        Restore the counters.
 
-        :param state: the counters
+        :param state: what :meth:`get_training_state` returned
         """
         self.n_calls, self.num_timesteps = state["n_calls"], state["num_timesteps"]
 
     def _restore_if_resumed(self) -> None:
         if self.model.resumption is not None:
+            assert self.model.callback is not None
             restore(self.model, self.model.callback, self.model.resumption)
             self.model.resumption = None
             self._saved_at = self.num_timesteps = self.model.num_timesteps
@@ -134,9 +155,11 @@ class TrainingCheckpointCallback(BaseCallback):
     def _save(self) -> None:
         self._saved_at = self.num_timesteps
         settings = {"save_freq": self.save_freq, "keep": self.keep, "verbose": self.verbose}
+        assert self.model.callback is not None
+        warn_of_unsaved(self.model, self.model.callback)
         state = gather(self.model, self.model.callback)
         self._store.save(self.num_timesteps, state | {"checkpoint": settings})
-        self.model.saved_to |= {self._folder}
+        self.model.saved_to = {**self.model.saved_to, self._folder: self._store.digests()}
         if self.verbose >= 2:
             print(f"Saving the training state of step {self.num_timesteps} to {self.path}")
 
@@ -144,17 +167,17 @@ class TrainingCheckpointCallback(BaseCallback):
         self._is_asked_to_stop = False
         handler = signal.getsignal(signal.SIGTERM)
         is_watched = isinstance(getattr(handler, "__self__", None), TrainingCheckpointCallback)
-        # Python allows it in the main thread alone, and a handler that is not Python's (None) could not be put back
+        # Python allows it in the main thread only, and a handler that is not Python's (None) could not be restored
         if threading.current_thread() is threading.main_thread() and handler is not None and not is_watched:
             self._watching_process = os.getpid()
             self._previous_handler = signal.signal(signal.SIGTERM, self._note_termination)
 
     def _note_termination(self, number: int, frame: FrameType | None) -> None:
-        self.release()
+        self._restore_handler()
         if os.getpid() == self._watching_process:
             self._is_asked_to_stop = True
         else:
-            # Forked off during the training, as by a simulator: such a process ends as it would without this
+            # A process that was forked during the training, as by a simulator, ends as it would without this callback
             os.kill(os.getpid(), number)
 
     def _stop(self) -> NoReturn:
@@ -162,7 +185,11 @@ class TrainingCheckpointCallback(BaseCallback):
         raise SystemExit(128 + signal.SIGTERM)
 
     def release(self) -> None:
-        """Let SIGTERM act as it did before the training."""
+        """Restore the handling of SIGTERM, and save no state until the next training starts, as this one may have failed."""
+        self._rollout_is_over = self._has_trained_without_rollouts = False
+        self._restore_handler()
+
+    def _restore_handler(self) -> None:
         if self._previous_handler is not None:
             signal.signal(signal.SIGTERM, self._previous_handler)
             self._previous_handler = None

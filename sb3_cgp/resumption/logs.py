@@ -1,4 +1,4 @@
-"""SB3's logs, which a training that goes on must go on in: the files of monitors, and TensorBoard's events."""
+"""Continue SB3's logs in a resumed training: the files of monitors, and TensorBoard's events."""
 
 import json
 import os
@@ -9,7 +9,7 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 
 def read_start(path: Path) -> float:
     """
-    Read when a monitor's file was begun, from which its times count.
+    Return the time at which a monitor's file was started, which its times count from.
 
     :param path: the file
     :return: seconds since the epoch
@@ -20,10 +20,11 @@ def read_start(path: Path) -> float:
 
 def cut_monitors(path: Path, n_episodes: int | None, n_steps: int) -> None:
     """
-    Cut off the last episodes of a monitor's file, in place: whatever has it open to append goes on behind those that are left.
+    Cut off the last episodes of a monitor's file, in place, so that a process that has it open to append continues after the
+    remaining ones.
 
     :param path: the file
-    :param n_episodes: how many episodes are left, at most. None for those whose steps are not more than ``n_steps``.
+    :param n_episodes: the largest number of episodes to keep. None keeps those that ended within ``n_steps`` steps.
     :param n_steps: the environment's steps
     """
     with open(path, "rb") as file:
@@ -40,11 +41,11 @@ def cut_monitors(path: Path, n_episodes: int | None, n_steps: int) -> None:
 
 def continued_logger(folder: str, first_step: int, verbose: int) -> Logger:
     """
-    Make the logger that SB3 makes for TensorBoard, in a folder that has events.
+    Make the logger that SB3 makes for TensorBoard, in a folder that already has events.
 
     :param folder: the folder
-    :param first_step: from which step on TensorBoard hides what is there: it is about to come again
-    :param verbose: whether it prints, too
+    :param first_step: the step from which on TensorBoard hides the existing events, as they are about to be written again
+    :param verbose: the verbosity level; from 1 on, the log is printed, too
     :return: the logger
     """
     outputs: list[KVWriter] = [make_output_format("stdout", folder)] if verbose >= 1 else []
@@ -52,10 +53,10 @@ def continued_logger(folder: str, first_step: int, verbose: int) -> Logger:
 
 
 class _ContinuedTensorBoard(TensorBoardOutputFormat):
-    """SB3's writer for TensorBoard, whose constructor makes one that purges nothing."""
+    """SB3's writer for TensorBoard, with ``purge_step``, which SB3's constructor does not take."""
 
     def __init__(self, folder: str, first_step: int):
-        # TensorBoard is optional, as it is for SB3
+        # Late, as it imports TensorBoard
         from torch.utils.tensorboard import SummaryWriter
 
         self.writer = SummaryWriter(log_dir=folder, purge_step=first_step)

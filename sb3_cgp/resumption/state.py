@@ -1,98 +1,91 @@
 """
-The whole state of a training, from which it goes on to the bit: what SB3 saves, and everything that it leaves out.
+The whole state of a training, from which it continues to the bit: SB3's zip, and all state that the zip leaves out.
 
-A state is a tree of plain data, arrays and tensors (:mod:`.store`). What SB3 saves itself is in it as SB3's own zip.
+A state is a tree of plain data, arrays and tensors (:mod:`sb3_cgp.resumption.encoding`).
 """
 
-import inspect
 import io
 import os
 import random
 import warnings
-from collections import Counter
-from collections.abc import Iterator
-from enum import Enum
-from types import FunctionType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cgp.common.episodes import end_last_episode
 from sb3_cgp.common.rules import require
-from sb3_cgp.resumption.environments import environment_state, restore_environment, why_not_restorable
+from sb3_cgp.resumption.callback_states import callback_states, restore_callbacks, warn_of_unrestorable
+from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
+from sb3_cgp.resumption.model import ResumableModel, State
 from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
+from sb3_cgp.resumption.replay_buffers import replay_buffer_state
 
-if TYPE_CHECKING:
-    from sb3_cgp.resumption.algorithm import ResumableAlgorithm
-
-State = dict[str, Any]
 # VecNormalize's statistics, which outlive an episode
 STATISTICS = ("obs_rms", "ret_rms")
-# Of a replay buffer's attributes; its environment is saved as the model's
-STATELESS_TYPES = (Enum, FunctionType, np.dtype, spaces.Space, th.device, type, VecEnv)
 
 
-def gather(model: "ResumableAlgorithm", callback: BaseCallback) -> State:
+def gather(model: ResumableModel, callback: BaseCallback) -> State:
     """
     Gather the whole state of a training, between a gradient step and the next step of the environment.
 
     :param model: the model
     :param callback: the training's callbacks
-    :return: the state; arrays may be those that training goes on to change
+    :return: the state; its arrays may be those that the training goes on to change
     """
     assert model.env is not None
-    assert model.replay_buffer is not None
+    # First, as a model may bring its other state up to date here
+    own = model.get_training_state()
     zipped = io.BytesIO()
     model.save(zipped)
     normalizer = model.get_vec_normalize_env()
+    environment = environment_state(model.env)
     return {
         "algorithm": type(model).__name__,
         "n_envs": model.n_envs,
+        "own": own,
         "model": zipped.getvalue(),
-        "replay_buffer": _replay_state(model.replay_buffer),
-        "environment": environment_state(model.env),
-        "not_restorable": why_not_restorable(model.env),
-        "statistics": None if normalizer is None else plain_attributes(normalizer, without=_all_but(normalizer, STATISTICS)),
-        "callbacks": [_callback_state(each, model.env) for each in walk(callback)],
+        "replay_buffer": replay_buffer_state(model._ensure_replay_buffer()),
+        "environment": environment,
+        "not_restorable": None if environment is not None else " ".join(obstacles(model.env)),
+        "statistics": None if normalizer is None else plain_attributes(normalizer, set(vars(normalizer)) - set(STATISTICS)),
+        "callbacks": callback_states(callback, model.env),
         "logger": _pending(model.logger),
         "log_folder": None if model.logger.dir is None else os.path.abspath(model.logger.dir),
         "random": _random_state(model),
     }
 
 
-def restore(model: "ResumableAlgorithm", callback: BaseCallback, state: State) -> None:
+def restore(model: ResumableModel, callback: BaseCallback, state: State) -> None:
     """
-    Restore what ``ResumableAlgorithm.resume`` and SB3 have not: the last of it are the random states.
+    Restore the part of the state that neither ``ResumableAlgorithm.resume`` nor SB3 has restored.
 
-    :param model: the model, where the training that is to go on was interrupted
-    :param callback: the callbacks of the training that goes on
+    :param model: the model of the resumed training
+    :param callback: the callbacks of the resumed training
     :param state: the state
-    :raises ValueError: if the environment is not the one that was saved
+    :raises ValueError: if the environment is not the saved one
     """
     assert model.env is not None
     if state["environment"] is not None:
         restore_environment(model.env, state["environment"])
         vars(model).update(state["last"])
-    _restore_callbacks(callback, state["callbacks"])
+    restore_callbacks(callback, state["callbacks"])
     for name, values in state["logger"].items():
         pending = getattr(model.logger, name)
         pending.clear()
         pending.update(values)
+    model.set_training_state(state["own"])
+    # Last, as the calls above may draw random numbers
     _restore_random(model, state["random"])
 
 
-def begin_new_episode(model: "ResumableAlgorithm", state: State) -> None:
+def begin_new_episode(model: ResumableModel, state: State) -> None:
     """
-    Let a training whose environment cannot be restored go on at an episode's start.
+    Prepare a training whose environment cannot be restored to continue at the start of an episode.
 
-    :param model: the model, its environment about to be reset
+    :param model: the model, whose environment is about to be reset
     :param state: the state
     """
     warnings.warn(
@@ -101,142 +94,47 @@ def begin_new_episode(model: "ResumableAlgorithm", state: State) -> None:
         stacklevel=2,
     )
     model._last_obs = None
-    assert model.replay_buffer is not None
-    end_last_episode(model.replay_buffer)
+    end_last_episode(model._ensure_replay_buffer())
     normalizer = model.get_vec_normalize_env()
     if normalizer is not None and state["statistics"] is not None:
         set_plain_attributes(normalizer, state["statistics"])
 
 
-def fill_replay_buffer(buffer: ReplayBuffer, state: State) -> None:
+def warn_of_unsaved(model: ResumableModel, callback: BaseCallback) -> None:
     """
-    Fill an empty replay buffer with the transitions that were saved.
+    Warn of environments whose state cannot be saved, once in a training for each.
 
-    :param buffer: the buffer
-    :param state: the buffer's part of the state
-    :raises ValueError: if it is of another class, or too small for them
+    :param model: the model
+    :param callback: the training's callbacks
     """
-    name = type(buffer).__name__
-    require(name == state["class"], "replay_buffer_class", name, f"{state['class']}, as was saved")
-    arrays = dict(_row_arrays(buffer))
-    for path, rows in state["rows"].items():
-        fits = path in arrays and len(rows) <= len(arrays[path]) and rows.shape[1:] == arrays[path].shape[1:]
-        shape = arrays[path].shape if path in arrays else None
-        require(fits, f"replay_buffer.{path}", shape, f"of a shape that {rows.shape} fits into")
-        arrays[path][: len(rows)] = th.from_numpy(rows) if isinstance(arrays[path], th.Tensor) else rows
-    set_plain_attributes(buffer, state["attributes"])
+    assert model.env is not None
+    problems = obstacles(model.env)
+    found = warn_of_unrestorable(callback, model.env)
+    if problems:
+        consequence = "A resumed training will go on at the start of an episode, and will not equal an uninterrupted one."
+        found.insert(0, f"The environment's state cannot be saved. {' '.join(problems)} {consequence}")
+    for message in found:
+        if message not in model._warned_of:
+            warnings.warn(message, stacklevel=2)
+    model._warned_of |= set(found)
 
 
-def check_replay_buffer(buffer: ReplayBuffer) -> None:
+def check_fits(model: ResumableModel, state: State) -> None:
     """
-    See that a replay buffer can be saved.
+    Refuse a state whose number of environments is not that of the model's environment and action noise.
 
-    :param buffer: the buffer
-    :raises ValueError: if it keeps the environment's information, which may be anything, or has a state of another kind
+    :param model: the loaded model
+    :param state: the state
+    :raises ValueError: if a number of environments differs
     """
-    copies = isinstance(buffer, HerReplayBuffer) and buffer.copy_info_dict
-    require(not copies, "copy_info_dict", copies, "False where the training is saved")
-    state = _replay_state(buffer)
-    saved = {path.partition(".")[0] for path in state["rows"]} | set(state["attributes"]) | {"infos"}
-    for name, value in vars(buffer).items():
-        is_saved = name in saved or isinstance(value, STATELESS_TYPES)
-        require(is_saved, f"replay_buffer.{name}", value, "plain data or an array where the training is saved")
-
-
-def walk(callback: BaseCallback) -> list[BaseCallback]:
-    """
-    List a callback and those within it.
-
-    :param callback: the callback
-    :return: the callbacks, each before those within it, and once
-    """
-    found = [callback]
-    # What is found is looked at in its turn
-    for each in found:
-        for value in vars(each).values():
-            children = value if isinstance(value, list) else [value]
-            found += [child for child in children if isinstance(child, BaseCallback) and child not in found]
-    return found
-
-
-def _replay_state(buffer: ReplayBuffer) -> State:
-    # The row after the last one holds its next observation where memory is saved
-    n_rows = buffer.buffer_size if buffer.full else min(buffer.pos + 1, buffer.buffer_size)
-    arrays = dict(_row_arrays(buffer))
-    rows = {path: array[:n_rows] for path, array in arrays.items()}
-    return {
-        "class": type(buffer).__name__,
-        "rows": {path: array.numpy(force=True) if isinstance(array, th.Tensor) else array for path, array in rows.items()},
-        "attributes": plain_attributes(buffer, without={"infos", *(path.partition(".")[0] for path in arrays)}),
-    }
-
-
-def _row_arrays(buffer: ReplayBuffer) -> Iterator[tuple[str, Any]]:
-    """List a buffer's arrays, or tensors, of a row for each step."""
-    for name, value in vars(buffer).items():
-        fields = {f"{name}.{key}": field for key, field in value.items()} if isinstance(value, dict) else {name: value}
-        for path, field in fields.items():
-            is_array = isinstance(field, th.Tensor) or (isinstance(field, np.ndarray) and field.dtype != object)
-            if is_array and field.ndim > 1 and len(field) == buffer.buffer_size:
-                yield path, field
-
-
-def _callback_state(callback: BaseCallback, training_env: VecEnv) -> State:
-    """Save a callback's own counters, and the environments that it evaluates on."""
-    environments = {
-        name: environment_state(value)
-        for name, value in vars(callback).items()
-        if isinstance(value, VecEnv) and value is not training_env
-    }
-    state: State = {"class": _class_name(callback), "environments": environments}
-    if hasattr(callback, "get_training_state"):
-        return state | {"own": callback.get_training_state()}
-    return state | {"attributes": plain_attributes(callback, without={"locals", "globals", *_arguments(type(callback))})}
-
-
-def _restore_callbacks(callback: BaseCallback, states: list[State]) -> None:
-    """Restore callbacks by their class and order."""
-    present: dict[tuple[str, int], BaseCallback] = {}
-    seen: Counter[str] = Counter()
-    for each in walk(callback):
-        present[_class_name(each), seen[_class_name(each)]] = each
-        seen[_class_name(each)] += 1
-    saved: Counter[str] = Counter()
-    for state in states:
-        name = state["class"]
-        found = present.get((name, saved[name]))
-        saved[name] += 1
-        if found is None:
-            if state["environments"] or not name.startswith("stable_baselines3."):
-                warnings.warn(f"A {name} was among the callbacks, and is not now: what it counted is lost.", stacklevel=2)
-            continue
-        if "own" in state:
-            found.set_training_state(state["own"])  # type: ignore[attr-defined]
-        else:
-            set_plain_attributes(found, state["attributes"])
-        for attribute, environment in state["environments"].items():
-            if environment is None:
-                message = f"The state of {name}'s `{attribute}` is not known: its episodes are others than without a stop."
-                warnings.warn(message, stacklevel=2)
-            elif isinstance(getattr(found, attribute, None), VecEnv):
-                restore_environment(getattr(found, attribute), environment)
-
-
-def _class_name(thing: object) -> str:
-    return f"{type(thing).__module__}.{type(thing).__qualname__}"
-
-
-def _arguments(callback_class: type) -> set[str]:
-    """List the arguments of a class's constructors: whoever makes the callback anew says them anew."""
-    return {name for each in callback_class.__mro__ for name in inspect.signature(each).parameters if each is not object}
-
-
-def _all_but(thing: object, names: tuple[str, ...]) -> set[str]:
-    return set(vars(thing)) - set(names)
+    n_envs, saved = state["n_envs"], f"{state['n_envs']}, as was saved"
+    require(model.n_envs == n_envs, "env.num_envs", model.n_envs, saved)
+    noises = getattr(model.action_noise, "noises", None)
+    require(noises is None or len(noises) == n_envs, "action_noise.n_envs", len(noises or ()), saved)
 
 
 def _pending(logger: Logger) -> State:
-    """Save what is recorded and not yet written, but for pictures and the like."""
+    """Copy the recorded values that are not written yet, except for images and the like."""
     plain = {key: value for key, value in logger.name_to_value.items() if isinstance(value, (int, float, str, np.generic))}
     return {
         "name_to_value": plain,
@@ -245,7 +143,7 @@ def _pending(logger: Logger) -> State:
     }
 
 
-def _random_state(model: "ResumableAlgorithm") -> State:
+def _random_state(model: ResumableModel) -> dict[str, Any]:
     return {
         "python": random.getstate(),
         "numpy": np.random.get_state(),  # noqa: NPY002  # SB3's generator
@@ -255,10 +153,12 @@ def _random_state(model: "ResumableAlgorithm") -> State:
     }
 
 
-def _restore_random(model: "ResumableAlgorithm", state: State) -> None:
+def _restore_random(model: ResumableModel, state: dict[str, Any]) -> None:
     random.setstate(state["python"])
     np.random.set_state(state["numpy"])  # noqa: NPY002
     th.set_rng_state(state["torch"])
-    for index, cuda_state in enumerate(state["cuda"][: th.cuda.device_count()]):
+    # Another machine may have fewer GPUs, or none
+    n_devices = th.cuda.device_count() if th.cuda.is_available() else 0
+    for index, cuda_state in enumerate(state["cuda"][:n_devices]):
         th.cuda.set_rng_state(cuda_state, index)
     model.action_space.np_random.bit_generator.state = state["action_space"]

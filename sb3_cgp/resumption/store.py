@@ -1,42 +1,38 @@
 """
-A folder of training states: each as a whole or not at all, verified when read, and nothing written twice.
+A folder of training states, each of which is written as a whole or not at all, and verified when it is read.
 
-``state-<step>.json`` holds a state's plain data. Arrays lie in a folder of blocks, files called by the SHA-256 of what they
-hold, so that states share what they have in common: a replay buffer is in every state, and what has changed of it is written.
-There are two such folders, and states take them in turn: no damage to one file can take two states that follow each other.
-Nothing is pickled.
+``state-<step>.json`` holds a state's plain data. Arrays lie in a folder of blocks, which are files named by the SHA-256 of
+their content, so that states share equal blocks: of a replay buffer, only the changed blocks are written. There are two such
+folders, which states use in turn: damage to one file cannot destroy two successive states. Nothing is pickled.
 """
 
 import hashlib
 import json
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch as th
-
 from sb3_cgp.common.files import PARTIAL, write_atomically
+from sb3_cgp.resumption.encoding import Decoder, Encoder, iter_digests
 
 FORMAT = "sb3_cgp training state"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 BLOCK_FOLDERS = ("blocks-0", "blocks-1")
-# Of an array
-BLOCK_BYTES = 2**22
-# Arrays below it share blocks
-SMALL_BYTES = 2**16
+# Bytes of a manifest that hold its checksum
+MANIFEST_PREFIX = 76
 DIGEST = re.compile("[0-9a-f]{64}")
-ARRAY_KINDS = "biufc"
 
 
 class DamagedStateError(ValueError):
     """
-    A file of a state is not what was written.
+    A file of a state has been altered since it was written.
 
     :param path: the file
-    :param reason: what is wrong with it
+    :param reason: the damage
     """
 
     def __init__(self, path: Path, reason: str):
@@ -54,19 +50,19 @@ class StateStore:
     A state is a tree of dictionaries (keys: strings, integers), lists, tuples, None, booleans, numbers, strings, bytes, NumPy
     arrays and scalars, and PyTorch tensors, which come back on the CPU.
 
-    :param folder: the folder; it is made when the first state is saved
+    :param folder: the folder, which is made when the first state is saved
     :param keep: how many states to keep, at least 1. If it is 1, only one of the folders of blocks is used.
     """
 
     def __init__(self, folder: str | Path, keep: int = 2):
         self.folder = Path(folder)
         self.keep = keep
-        # Written or read and verified by this process
+        # The blocks that this process has written, or read and verified
         self._good_blocks: set[Path] = set()
 
     def prepare(self) -> None:
         """
-        Make the folder, and see that states can be written to it.
+        Make the folder, and check that states can be written to it.
 
         :raises OSError: if they cannot, naming the file
         """
@@ -76,18 +72,30 @@ class StateStore:
 
     def steps(self) -> list[int]:
         """
-        List the states, damaged ones too.
+        List the states, damaged ones included.
 
         :return: their steps, ascending
         """
         found = (re.fullmatch(r"state-(\d{12})\.json", path.name) for path in self.folder.glob("state-*.json"))
         return sorted(int(match[1]) for match in found if match)
 
+    def digests(self) -> frozenset[str]:
+        """
+        Return the digests of the states, by which a training recognises its own.
+
+        :return: the step and the checksum of each state, unverified
+        """
+        found = set()
+        for step in self.steps():
+            with suppress(OSError), open(self._manifest(step), "rb") as file:
+                found.add(f"{step} {file.read(MANIFEST_PREFIX).decode(errors='replace')}")
+        return frozenset(found)
+
     def save(self, step: int, state: Mapping[str, Any]) -> None:
         """
         Save a state, and remove the oldest ones beyond those to keep.
 
-        Of states of later steps nothing is kept: they are ones that were damaged when the training was resumed.
+        States of later steps are removed: they were damaged when the training was resumed.
 
         :param step: the state's step
         :param state: the state
@@ -95,9 +103,9 @@ class StateStore:
         :raises OSError: if it cannot be written, naming the file; older states are still there
         """
         blocks = self._next_block_folder(step)
-        writer = _Writer(self, blocks)
-        tree = writer.encode(dict(state), "state")
-        writer.flush()
+        encoder = Encoder(partial(self._write_block, blocks))
+        tree = encoder.encode(dict(state), "state")
+        encoder.flush()
         body = {"format": FORMAT, "version": FORMAT_VERSION, "step": step, "blocks": blocks, "state": tree}
         content = json.dumps(body)
         digest = hashlib.sha256(content.encode()).hexdigest()
@@ -116,7 +124,7 @@ class StateStore:
         for step in reversed(self.steps()):
             try:
                 body = self._read_manifest(step)
-                state = _Reader(self, body["blocks"]).decode(body["state"])
+                state = Decoder(partial(self._read_block, body["blocks"])).decode(body["state"])
             except DamagedStateError as error:
                 damaged.append(str(error))
                 continue
@@ -131,7 +139,7 @@ class StateStore:
         return self.folder / f"state-{step:012d}.json"
 
     def _next_block_folder(self, step: int) -> str:
-        """Choose where a state's blocks go: not where those of the one before it are, so that one of them survives damage."""
+        """Return the folder of a state's blocks: not that of the state before it, so that one of them survives damage."""
         for each in reversed([each for each in self.steps() if each < step]):
             try:
                 last = BLOCK_FOLDERS.index(self._read_manifest(each)["blocks"])
@@ -160,11 +168,11 @@ class StateStore:
         return self.folder / blocks / digest
 
     def _has_good_block(self, blocks: str, digest: str, size: int) -> bool:
-        """Whether a block is there, and what it ought to be."""
+        """Return whether an undamaged block exists."""
         path = self._block(blocks, digest)
         try:
             if path in self._good_blocks:
-                # A look suffices, as its content was verified: there may be gigabytes of them
+                # The size suffices, as the content was verified before, and may be gigabytes
                 return path.stat().st_size == size
             self._read_block(blocks, digest)
         except (DamagedStateError, FileNotFoundError):
@@ -192,7 +200,7 @@ class StateStore:
         return digest
 
     def _prune(self, step: int) -> None:
-        """Remove what is not needed any more; a failure does no harm, and the next time makes up for it."""
+        """Remove the files that no state needs. The next call removes those that a failure leaves."""
         steps = self.steps()
         kept = [each for each in steps if each <= step][-self.keep :]
         for each in set(steps) - set(kept):
@@ -202,137 +210,12 @@ class StateStore:
             try:
                 body = self._read_manifest(each)
             except DamagedStateError:
-                # Which blocks it needs is not known
+                # The blocks that it needs are not known
                 return
-            needed.update(self._block(body["blocks"], digest) for digest in _digests(body["state"]))
+            needed.update(self._block(body["blocks"], digest) for digest in iter_digests(body["state"]))
         folders = [self.folder / name for name in BLOCK_FOLDERS]
         blocks = [path for folder in folders if folder.is_dir() for path in folder.iterdir()]
         for path in (*self.folder.glob(f"{PARTIAL}*"), *blocks):
             if path not in needed:
                 path.unlink(missing_ok=True)
         self._good_blocks &= needed
-
-
-class _Writer:
-    """
-    Makes JSON of a state, and writes its arrays.
-
-    :param store: where to
-    :param blocks: the folder of its blocks
-    """
-
-    def __init__(self, store: StateStore, blocks: str):
-        self._store, self._blocks = store, blocks
-        self._small = bytearray()
-        # Their references, which learn of their block when it is written
-        self._waiting: list[dict[str, Any]] = []
-
-    def encode(self, value: Any, place: str) -> Any:
-        """Make JSON of a value: itself, or a dictionary that says what it is."""
-        if value is None or type(value) in (bool, int, str):
-            return value
-        if type(value) is float:
-            # JSON has no infinities
-            return {"float": value.hex()}
-        if type(value) is dict:
-            items = [[self._encode_key(key, place), self.encode(each, f"{place}.{key}")] for key, each in value.items()]
-            return {"dict": items}
-        if type(value) in (list, tuple):
-            return {type(value).__name__: [self.encode(each, f"{place}[{index}]") for index, each in enumerate(value)]}
-        if type(value) is bytes:
-            return {"bytes": self._refer(memoryview(value))}
-        if isinstance(value, th.Tensor):
-            plain = value.detach().cpu().contiguous()
-            return {"tensor": str(plain.dtype), "shape": list(plain.shape), **self._refer(_bytes_of_tensor(plain))}
-        if isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in ARRAY_KINDS:
-            kind = "array" if isinstance(value, np.ndarray) else "scalar"
-            array = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
-            return {kind: value.dtype.newbyteorder("<").str, "shape": list(value.shape), **self._refer(_bytes_of(array))}
-        raise TypeError(f"{place} is a {type(value).__name__}, which a training state cannot hold.")
-
-    def _encode_key(self, key: Any, place: str) -> Any:
-        if type(key) in (str, int):
-            return key
-        raise TypeError(f"{place} has the key {key!r}, but keys must be strings or integers.")
-
-    def _refer(self, content: memoryview) -> dict[str, Any]:
-        """Write bytes, and say where they are."""
-        if content.nbytes >= SMALL_BYTES:
-            blocks = [content[start : start + BLOCK_BYTES] for start in range(0, content.nbytes, BLOCK_BYTES)]
-            return {"size": content.nbytes, "blocks": [self._store._write_block(self._blocks, block) for block in blocks]}
-        reference: dict[str, Any] = {"size": content.nbytes, "start": len(self._small), "blocks": []}
-        self._small += content
-        self._waiting.append(reference)
-        return reference
-
-    def flush(self) -> None:
-        """Write what small arrays share."""
-        digest = self._store._write_block(self._blocks, memoryview(self._small))
-        for reference in self._waiting:
-            reference["blocks"].append(digest)
-
-
-class _Reader:
-    """
-    Makes a state of JSON, and reads its arrays.
-
-    :param store: where from
-    :param blocks: the folder of its blocks
-    """
-
-    def __init__(self, store: StateStore, blocks: str):
-        self._store, self._blocks = store, blocks
-        self._shared: dict[str, bytes] = {}
-
-    def decode(self, value: Any) -> Any:
-        """Undo :meth:`_Writer.encode`."""
-        if not isinstance(value, dict):
-            return value
-        if "float" in value:
-            return float.fromhex(value["float"])
-        if "dict" in value:
-            return {key: self.decode(each) for key, each in value["dict"]}
-        for kind in (list, tuple):
-            if kind.__name__ in value:
-                return kind(self.decode(each) for each in value[kind.__name__])
-        if "bytes" in value:
-            return bytes(self._read(value["bytes"]))
-        content = self._read(value)
-        if "tensor" in value:
-            dtype = getattr(th, value["tensor"].removeprefix("torch."))
-            flat = th.frombuffer(content, dtype=dtype) if content else th.empty(0, dtype=dtype)
-            return flat.reshape(value["shape"])
-        dtype = np.dtype(value.get("array") or value["scalar"])
-        array = np.frombuffer(content, dtype).reshape(value["shape"])
-        return array if "array" in value else array[()]
-
-    def _read(self, reference: dict[str, Any]) -> bytearray:
-        """Read and verify bytes."""
-        size, digests = reference["size"], reference["blocks"]
-        if "start" in reference:
-            (digest,) = digests
-            if digest not in self._shared:
-                self._shared[digest] = self._store._read_block(self._blocks, digest)
-            return bytearray(self._shared[digest][reference["start"] : reference["start"] + size])
-        content = bytearray()
-        for digest in digests:
-            content += self._store._read_block(self._blocks, digest)
-        return content
-
-
-def _bytes_of(array: np.ndarray) -> memoryview:
-    return array.reshape(-1).view(np.uint8).data
-
-
-def _bytes_of_tensor(tensor: th.Tensor) -> memoryview:
-    return tensor.reshape(-1).view(th.uint8).numpy().data
-
-
-def _digests(value: Any) -> Iterator[str]:
-    """List the blocks that a state needs."""
-    if isinstance(value, dict):
-        yield from value.get("blocks", ())
-        value = list(value.values())
-    if isinstance(value, list):
-        for each in value:
-            yield from _digests(each)

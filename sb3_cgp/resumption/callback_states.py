@@ -1,0 +1,113 @@
+"""The states of callbacks, and of the environments that they evaluate on."""
+
+import warnings
+from collections import Counter
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
+from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
+from sb3_cgp.resumption.replay_buffers import constructor_arguments
+
+State = dict[str, Any]
+
+
+def iter_callbacks(callback: BaseCallback) -> list[BaseCallback]:
+    """
+    List a callback and all callbacks within it.
+
+    :param callback: the callback
+    :return: the callbacks, each before those within it, and once
+    """
+    found = [callback]
+    # The list grows while it is read
+    for each in found:
+        for value in vars(each).values():
+            children = value if isinstance(value, list) else [value]
+            found += [child for child in children if isinstance(child, BaseCallback) and child not in found]
+    return found
+
+
+def callback_states(callback: BaseCallback, training_env: VecEnv) -> list[State]:
+    """
+    Return the states of all callbacks.
+
+    :param callback: the training's callback
+    :param training_env: the training's environment, which is not saved with a callback
+    :return: plain data, for each callback in the order of :func:`iter_callbacks`
+    """
+    return [_callback_state(each, training_env) for each in iter_callbacks(callback)]
+
+
+def warn_of_unrestorable(callback: BaseCallback, training_env: VecEnv) -> list[str]:
+    """
+    Describe the environments of callbacks whose state cannot be saved.
+
+    :param callback: the training's callback
+    :param training_env: the training's environment
+    :return: a sentence for each such environment
+    """
+    found = []
+    for each in iter_callbacks(callback):
+        for name, env in _environments(each, training_env).items():
+            problems = obstacles(env)
+            if problems:
+                found.append(f"The state of {type(each).__name__}'s `{name}` cannot be saved: {' '.join(problems)}")
+    return found
+
+
+def restore_callbacks(callback: BaseCallback, states: list[State]) -> None:
+    """
+    Restore callbacks, which are identified by their class and order.
+
+    :param callback: the callback of the resumed training
+    :param states: what :func:`callback_states` returned
+    :raises ValueError: if an evaluation environment is not the saved one
+    """
+    present: dict[tuple[str, int], BaseCallback] = {}
+    seen: Counter[str] = Counter()
+    for each in iter_callbacks(callback):
+        present[_class_name(each), seen[_class_name(each)]] = each
+        seen[_class_name(each)] += 1
+    saved: Counter[str] = Counter()
+    for state in states:
+        name = state["class"]
+        found = present.get((name, saved[name]))
+        saved[name] += 1
+        if found is None:
+            if state["environments"] or not name.startswith("stable_baselines3."):
+                warnings.warn(f"A {name} was among the callbacks, and is not now: what it counted is lost.", stacklevel=2)
+            continue
+        _restore_callback(found, state)
+
+
+def _restore_callback(callback: BaseCallback, state: State) -> None:
+    if "own" in state:
+        callback.set_training_state(state["own"])  # type: ignore[attr-defined]
+    else:
+        set_plain_attributes(callback, state["attributes"])
+    for attribute, environment in state["environments"].items():
+        if environment is None:
+            name = f"{state['class']}'s `{attribute}`"
+            warnings.warn(f"The state of {name} was not saved: its episodes differ from those without a stop.", stacklevel=2)
+        elif isinstance(getattr(callback, attribute, None), VecEnv):
+            restore_environment(getattr(callback, attribute), environment)
+
+
+def _callback_state(callback: BaseCallback, training_env: VecEnv) -> State:
+    environments = {name: environment_state(env) for name, env in _environments(callback, training_env).items()}
+    state: State = {"class": _class_name(callback), "environments": environments}
+    if hasattr(callback, "get_training_state"):
+        return state | {"own": callback.get_training_state()}
+    unsaved = {"locals", "globals", *constructor_arguments(type(callback))}
+    return state | {"attributes": plain_attributes(callback, without=unsaved)}
+
+
+def _environments(callback: BaseCallback, training_env: VecEnv) -> dict[str, VecEnv]:
+    return {name: value for name, value in vars(callback).items() if isinstance(value, VecEnv) and value is not training_env}
+
+
+def _class_name(thing: object) -> str:
+    return f"{type(thing).__module__}.{type(thing).__qualname__}"

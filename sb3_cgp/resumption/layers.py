@@ -1,0 +1,152 @@
+"""The state of one environment or wrapper, without what it wraps."""
+
+import io
+from functools import partial
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
+
+from sb3_cgp.resumption.mujoco_data import get_mujoco_data, is_restorable, mujoco_state, set_mujoco_state
+from sb3_cgp.resumption.plain_data import NotPlainError, from_plain, plain_attributes, set_plain_attributes, to_plain
+
+RESTORABLE_MODULES = (
+    "gymnasium.envs.classic_control.",
+    "gymnasium.envs.mujoco.",
+    "gymnasium.wrappers.",
+    "rl_zoo3.gym_patches.",
+    "rl_zoo3.wrappers.",
+    "sb3_cgp.resumption.environments.",
+    "sb3_contrib.common.wrappers.",
+    "stable_baselines3.common.monitor.",
+    "stable_baselines3.common.vec_env.",
+)
+STATELESS_TYPES = (
+    *(BuiltinFunctionType, EnvSpec, FunctionType, MethodType, ModuleType, ResultsWriter, StackedObservations),
+    *(io.IOBase, np.dtype, np.ufunc, partial, spaces.Space, type),
+)
+# MuJoCo's model does not change, and its data is saved apart
+STATELESS_MODULES = ("gymnasium.envs.mujoco.mujoco_rendering.", "mujoco.", "pygame.")
+UNSAVED = {
+    # The wrapped environments and stacks, each of which has a state of its own
+    *("env", "envs", "venv", "obs_spaces", "sub_stacked_observations"),
+    # The actions of a step that is over
+    "actions",
+    # SubprocVecEnv's connections
+    *("closed", "processes", "remotes", "waiting", "work_remotes"),
+    # Attributes of the class, and the constructor's arguments
+    *("class_attributes", "_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "fullpath"),
+    # Rendering, and the time of the clock
+    *("metadata", "render_mode", "frame_list", "recorded_frames", "render_history", "episode_start_time", "t_start"),
+}
+# The infos of the last step may hold anything, and are overwritten before they are read
+INFOS = {"buf_infos", "reset_infos"}
+RANDOM_STATE = {"_np_random", "_np_random_seed"}
+METHODS = "get_training_state() and set_training_state()"
+
+
+def layer_state(layer: Any, problems: list[str]) -> dict[str, Any]:
+    """
+    Copy the state of one environment or wrapper, without what it wraps.
+
+    :param layer: the environment or wrapper
+    :param problems: a list to which a sentence is appended for each obstacle to restoring the layer
+    :return: plain data, which is complete if no sentence was appended
+    :raises ValueError: if ``get_training_state()`` returns anything but plain data
+    """
+    kind = type(layer)
+    name = f"{kind.__module__}.{kind.__qualname__}"
+    state: dict[str, Any] = {"class": name}
+    # Looked up in the class, as wrappers of vectorised environments forward the attributes of the wrapped one
+    if hasattr(kind, "get_training_state"):
+        state["own"] = _own_state(layer, name, problems)
+        state["attributes"] = plain_attributes(layer, without=vars(layer).keys() - RANDOM_STATE)
+    else:
+        state["attributes"] = plain_attributes(layer, UNSAVED)
+        problems.extend(_problems(layer, name, state["attributes"].keys()))
+    state["spaces"] = {key: _space_state(value) for key, value in vars(layer).items() if isinstance(value, spaces.Space)}
+    data = get_mujoco_data(layer)
+    if data is not None:
+        if is_restorable(data):
+            state["mujoco"] = mujoco_state(data)
+        else:
+            problems.append(f"{name} has a MuJoCo model with plugins, flexible bodies or sleep.")
+    return state
+
+
+def set_layer_state(layer: Any, state: dict[str, Any]) -> None:
+    """
+    Restore the state of one environment or wrapper.
+
+    :param layer: the environment or wrapper
+    :param state: what :func:`layer_state` returned
+    """
+    # First, as it may draw random numbers
+    if "own" in state:
+        layer.set_training_state(from_plain(state["own"]))
+    set_plain_attributes(layer, state["attributes"])
+    for name, space_state in state["spaces"].items():
+        _set_space_state(vars(layer)[name], space_state)
+    data = get_mujoco_data(layer)
+    if data is not None:
+        set_mujoco_state(data, state["mujoco"])
+
+
+def is_known(module: str) -> bool:
+    """
+    Return whether the environments and wrappers of a module are known to be restorable.
+
+    :param module: the module's name
+    """
+    return f"{module}.".startswith(RESTORABLE_MODULES)
+
+
+def _own_state(layer: Any, name: str, problems: list[str]) -> Any:
+    own = layer.get_training_state()
+    if own is None:
+        problems.append(f"{name}.get_training_state() returned None.")
+    try:
+        return to_plain(own)
+    except NotPlainError as error:
+        message = f"{name}.get_training_state() returned {own!r}, but must return plain data: {error}"
+        raise ValueError(message) from error
+
+
+def _problems(layer: Any, name: str, saved: Any) -> list[str]:
+    """Return a sentence for each obstacle to restoring a layer without methods of its own."""
+    if not is_known(type(layer).__module__):
+        return [f"{name} is unknown and has no get_training_state(): it needs {METHODS}."]
+    unsaved = {key: vars(layer)[key] for key in vars(layer).keys() - saved - UNSAVED - INFOS}
+    in_the_way = {key: value for key, value in sorted(unsaved.items()) if not _is_stateless(value)}
+    return [f"{name}.{key} is {value!r}, which is no plain data." for key, value in in_the_way.items()]
+
+
+def _is_stateless(value: Any) -> bool:
+    """Return whether a value's type holds no state, or a state that is saved apart."""
+    return isinstance(value, STATELESS_TYPES) or f"{type(value).__module__}.".startswith(STATELESS_MODULES)
+
+
+def _subspaces(space: spaces.Space) -> list[spaces.Space]:
+    """List the spaces that a space is made of."""
+    found: list[Any] = []
+    for value in vars(space).values():
+        found.extend(value.values() if isinstance(value, dict) else value if isinstance(value, tuple | list) else [value])
+    return [each for each in found if isinstance(each, spaces.Space)]
+
+
+def _space_state(space: spaces.Space) -> dict[str, Any]:
+    """Copy the states of a space's random generators."""
+    # Not `np_random`, which makes a generator where there is none yet
+    random_state = {name: to_plain(value) for name, value in vars(space).items() if name in RANDOM_STATE}
+    return {"space": str(space), "attributes": random_state, "inside": [_space_state(each) for each in _subspaces(space)]}
+
+
+def _set_space_state(space: spaces.Space, state: dict[str, Any]) -> None:
+    """Restore the states of a space's random generators."""
+    set_plain_attributes(space, state["attributes"])
+    for each, inside in zip(_subspaces(space), state["inside"], strict=True):
+        _set_space_state(each, inside)

@@ -1,0 +1,89 @@
+"""Locks on folders of training states: a folder belongs to one training at a time."""
+
+import gc
+import os
+import socket
+import warnings
+from contextlib import suppress
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+LOCK_FILE = ".lock"
+# A file of its own, as some versions of filelock truncate the file that they lock
+OWNER_FILE = ".lock-owner"
+
+
+class FolderInUseError(RuntimeError):
+    """Another training uses the folder of training states."""
+
+
+class FolderLock:
+    """
+    An exclusive lock on a folder of training states.
+
+    The operating system releases it when its process ends, however that happens. A forked process does not inherit it.
+
+    :param folder: the folder, which must exist
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        # A model may be deleted in another thread than the one that it was resumed in
+        self._lock = FileLock(folder / LOCK_FILE, thread_local=False)
+        self._process = os.getpid()
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether this process acquired the lock, and not one that this process was forked from."""
+        return self._process == os.getpid()
+
+    def acquire(self) -> None:
+        """
+        Acquire the lock, without waiting for it.
+
+        In a folder that cannot be written to, no lock is needed. On a file system without locks, a warning is given.
+
+        :raises FolderInUseError: if another training holds it, naming its host and process
+        """
+        try:
+            self._acquire()
+        except Timeout:
+            # A deleted model may wait for the garbage collector, as it is part of reference cycles
+            gc.collect()
+            try:
+                self._acquire()
+            except Timeout:
+                raise FolderInUseError(
+                    f"The folder {self.folder} is in use by another training: {self._read_owner()}. A folder of training "
+                    "states belongs to one training at a time. Wait for that training to end, stop it, or, if it is a model "
+                    "in this process, delete that model."
+                ) from None
+
+    def _acquire(self) -> None:
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            raise
+        except (OSError, NotImplementedError) as error:
+            if os.access(self.folder, os.W_OK):
+                warnings.warn(
+                    f"The folder {self.folder} cannot be locked ({error}): see to it that no other process uses it.",
+                    stacklevel=2,
+                )
+            return
+        with suppress(OSError):
+            (self.folder / OWNER_FILE).write_text(f"process {os.getpid()} on host {socket.gethostname()}")
+
+    def _read_owner(self) -> str:
+        try:
+            return (self.folder / OWNER_FILE).read_text() or "an unknown process"
+        except OSError:
+            return "an unknown process"
+
+    def release(self) -> None:
+        """Release the lock. Does nothing if it is not held by this process."""
+        if self.is_ours and self._lock.is_locked:
+            with suppress(OSError):
+                (self.folder / OWNER_FILE).unlink()
+            self._lock.release(force=True)
