@@ -60,7 +60,21 @@ def wrapped(env):
     return DummyVecEnv([lambda: gym.wrappers.TimeLimit(env, 5)])
 
 
-@pytest.mark.parametrize("wrap", [bare, monitored, wrapped])
+class OwnWrapper(gym.Wrapper):
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, info
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = self.env.reset(seed=seed, options=options)
+        return observation, info
+
+
+def wrapped_by_another_package(env):
+    return DummyVecEnv([lambda: OwnWrapper(env)])
+
+
+@pytest.mark.parametrize("wrap", [bare, monitored, wrapped, wrapped_by_another_package])
 @pytest.mark.parametrize(
     ("env", "message"),
     [

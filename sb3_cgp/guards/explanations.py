@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, TypeVar
 
+import gymnasium as gym
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -73,8 +74,9 @@ def explain(error: Exception, model: OffPolicyAlgorithm) -> str | None:
         return f"The environment returned a reward that is not a number at environment step {model.num_timesteps}{reward}."
     if frame.f_code is HerReplayBuffer.sample.__code__ and isinstance(error, RuntimeError):
         return _explain_no_episode(frame.f_locals["self"], model.learning_starts)
-    # Not an error of the environment's own code, but of its callers: SB3, Gymnasium's wrappers, and this package
-    if frame.f_globals.get("__name__", "").startswith(("stable_baselines3.", "gymnasium.", "sb3_cgp.guards.")):
+    # Not an error of the environment's own code, but of its callers: SB3, Gymnasium, this package, and wrappers of any package
+    is_caller = frame.f_globals.get("__name__", "").startswith(("stable_baselines3.", "gymnasium.", "sb3_cgp.guards."))
+    if is_caller or isinstance(frame.f_locals.get("self"), gym.Wrapper):
         return _explain_old_api(str(error), frame.f_code.co_name)
     return None
 
