@@ -1,5 +1,5 @@
 """
-Captured gradient steps. Where there is no GPU, a stand-in for the graph carries the recorded function out again on the memory
+Gradient steps as CUDA graphs. Without a GPU, a stand-in for the graph carries the recorded function out again on the memory
 that it was recorded with: everything but PyTorch's CUDA graphs is tested on any machine, and these where there is a GPU.
 """
 
@@ -21,7 +21,7 @@ from sb3_cgp.fast.cuda_graphs import WARM_UP_CALLS, RecordedFunction
 from sb3_cgp.fast.recorded_optimizers import LossWatch
 
 needs_gpu = pytest.mark.usefixtures("gpu")
-# Learning rates are powers of two: a captured one is a float32
+# Learning rates are powers of two: a recorded one is a float32
 SMALL = dict(
     cuda_graphs=True,
     learning_rate=2**-10,
@@ -274,7 +274,7 @@ def test_a_synchronizing_step_is_carried_out_as_it_is(stand_in, monkeypatch):
     assert th.equal(parameters(model), parameters(make_model(cuda_graphs=False).learn(80)))
 
 
-def test_models_of_before_the_fused_adam_are_captured(stand_in):
+def test_models_of_before_the_fused_adam_are_recorded(stand_in):
     old = CGP("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[16], optimizer_kwargs=dict(fused=False)), **SMALL)
     old.learn(60)
     model = make_model(seed=5)
@@ -291,7 +291,7 @@ def test_models_of_before_the_fused_adam_are_captured(stand_in):
         dict(optimizer_kwargs=dict(fused=False)),
     ],
 )
-def test_other_optimisers_are_not_captured(stand_in, kwargs):
+def test_other_optimizers_are_not_recorded(stand_in, kwargs):
     model = make_model()
     assert model._records_steps
     assert not CGP("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[8]) | kwargs, **SMALL)._records_steps
