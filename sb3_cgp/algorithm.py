@@ -21,12 +21,22 @@ from sb3_cgp.fast.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_cgp.fast.replay import LeanReplayAlgorithm
 from sb3_cgp.fast.scoring import SCORING_DTYPES
 from sb3_cgp.guards.algorithm import GuardedAlgorithm
+from sb3_cgp.guards.losses import LossGuard
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
 
 SelfCGP = TypeVar("SelfCGP", bound="CGP")
 
 
-class CGP(ResumableAlgorithm, DiagnosticsAlgorithm, CudaGraphAlgorithm, GuardedAlgorithm, LeanReplayAlgorithm, core.CGP):
+class CGP(
+    ResumableAlgorithm,
+    GuardedAlgorithm,
+    DiagnosticsAlgorithm,
+    # Records `train` and `_descend` of the classes below it
+    CudaGraphAlgorithm,
+    LossGuard,
+    LeanReplayAlgorithm,
+    core.CGP,
+):
     """
     Cross-Entropy Guided Policies (CGP).
 

@@ -13,7 +13,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch as th
+from environments import Doubles
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cgp import CEM, CGP
 from sb3_cgp.fast import cuda_graph_algorithm, cuda_graphs
@@ -252,6 +254,19 @@ def test_a_training_state_has_the_losses_of_recorded_steps_in_its_log(stand_in):
     model.train(1, 16)
     with pytest.raises(ValueError, match="The critic loss was NaN or infinite at gradient step 32"):
         model.get_training_state()
+
+
+def test_guards_see_trainings_whose_steps_are_all_replayed(stand_in):
+    model = CGP("MlpPolicy", Doubles(), train_freq=(1, "episode"), policy_kwargs=dict(net_arch=[16]), **SMALL).learn(60)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Learnt from the first episode on, although nothing but graphs is replayed
+        model.learn(5, reset_num_timesteps=False)
+    env = VecNormalize(DummyVecEnv([Doubles]))
+    model.set_env(env)
+    with pytest.warns(UserWarning, match="has learnt from observations that were not normalised"):
+        model.learn(5, reset_num_timesteps=False)
+    assert model._learnt_normalized is True
 
 
 @pytest.mark.parametrize("copy_of", [copy.deepcopy, lambda model: pickle.loads(pickle.dumps(model))], ids=["copy", "pickle"])

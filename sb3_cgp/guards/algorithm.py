@@ -21,9 +21,10 @@ class GuardedAlgorithm(
     # Looks at the first observations when the next one has reset the environment
     TransitionGuard,
     EpisodeGuard,
-    LossGuard,
     NetworkGuard,
     LearningStartsGuard,
+    # Last, so that a class may name it again behind another base that overrides `_descend`
+    LossGuard,
 ):
     """
     An algorithm that notices faults of environments and wrong use, and names them or does the right thing.
