@@ -80,9 +80,9 @@ class CGP(
         None trains no actor, so that CEM acts at inference too
     :param policy_training: "online" trains the actor along with the critics, "offline" at the end of ``learn``
         (see :meth:`train_policy`)
-    :param inference: what ``predict`` asks: the "actor", the "averaged_actor" (φ' of Algorithm 2) or "cem".
-        None stands for the actor, or for CEM where there is no ``policy_loss``. In any case, CEM acts while training,
-        and in offline training until the policy is trained.
+    :param inference: what ``predict`` uses: the "actor", the "averaged_actor" (φ' of Algorithm 2) or "cem".
+        None stands for the actor, or for CEM where there is no ``policy_loss``. Rollouts always use CEM, and so does
+        ``predict`` before the policy's offline training.
     :param actor_learning_rate: learning rate of the actor, in the same forms. None stands for ``learning_rate``.
     :param policy_delay: The actor is updated once every ``policy_delay`` gradient steps
     :param target_update_interval: The target critics and the averaged actor are updated once every
@@ -262,7 +262,7 @@ class CGP(
 
     def export(self, folder: str | pathlib.Path) -> None:
         """
-        Write the policy that ``predict`` asks, to be used elsewhere and loaded without pickle.
+        Write the policy that ``predict`` uses, to be used elsewhere and loaded without pickle.
 
         ``policy.onnx`` takes a batch of observations as the environment returns them (images channels first) and returns
         actions as the environment takes them; VecNormalize's present statistics are part of it.

@@ -81,10 +81,10 @@ class DiagnosticsAlgorithm(CGP):
         if self._n_updates // INTERVAL > n_updates // INTERVAL:
             self._log_diagnostics(batch_size, self._trains_online)
 
-    def _record_losses(self, losses: dict[str, list[th.Tensor]]) -> None:
-        super()._record_losses(losses)
+    def _record_means(self, values: dict[str, list[th.Tensor]]) -> None:
+        super()._record_means(values)
         # Without the critics' loss, these are the losses of a round of offline policy training
-        if "critic_loss" not in losses:
+        if "critic_loss" not in values:
             self._log_diagnostics(self.batch_size, has_actor=True)
 
     def _log_diagnostics(self, batch_size: int, has_actor: bool) -> None:

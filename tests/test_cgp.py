@@ -268,6 +268,40 @@ class TestOffline:
         loaded.save(tmp_path / "trained")
         assert CGP.load(tmp_path / "trained").policy.inference == "actor"
 
+    def test_a_policy_that_a_callback_stops_too_early_is_warned_of(self):
+        with pytest.warns(UserWarning, match="A callback stopped the policy's training after 7 steps: CEM acts"):
+            make_model(policy_training="offline").learn(100, callback=self.Watcher(stop_after=107))
+
+    def test_a_model_trained_online_acts_by_its_actor_when_it_is_loaded_to_train_offline(self, tmp_path):
+        make_model().learn(100).save(tmp_path / "model")
+        assert CGP.load(tmp_path / "model", policy_training="offline").policy.inference == "actor"
+        assert CGP.load(tmp_path / "model", policy_loss=None).policy.inference == "cem"
+        make_model().save(tmp_path / "untrained")
+        assert CGP.load(tmp_path / "untrained", policy_training="offline").policy.inference == "cem"
+
+    @pytest.mark.parametrize("policy_loss", ["cgp", "qgp"])
+    def test_critics_with_batch_norm_stay_as_they_are(self, policy_loss):
+        class Normalizing(BaseFeaturesExtractor):
+            def __init__(self, observation_space):
+                super().__init__(observation_space, 3)
+                self.norm = th.nn.BatchNorm1d(3)
+
+            def forward(self, observations):
+                return self.norm(observations)
+
+        kwargs = dict(net_arch=[16], features_extractor_class=Normalizing)
+        model = make_model(policy_loss=policy_loss, policy_kwargs=kwargs).learn(100)
+        before = {name: value.clone() for name, value in model.critic.state_dict().items()}
+        actor = {name: value.clone() for name, value in model.actor.state_dict().items()}
+        model.train_policy(max_steps=30)
+        assert all(th.equal(before[name], value) for name, value in model.critic.state_dict().items())
+        assert not any(th.equal(actor[name], value) for name, value in model.actor.state_dict().items())
+
+    def test_a_shared_extractor_is_refused_as_it_would_change_the_critics(self):
+        model = make_model(policy_kwargs=dict(net_arch=[16], share_features_extractor=True)).learn(60)
+        with pytest.raises(ValueError, match="`share_features_extractor` is True, but must be False to train a policy apart"):
+            model.train_policy()
+
     def test_callbacks_see_the_locals_of_an_online_training(self):
         class Locals(self.Watcher):
             def __init__(self):
@@ -310,7 +344,7 @@ class TestOffline:
 
     def test_needs_a_policy_loss_and_steps(self):
         model = make_model(policy_loss=None).learn(100)
-        with pytest.raises(ValueError, match="`policy_loss` is None, but must be 'cgp' or 'qgp'"):
+        with pytest.raises(ValueError, match="`policy_loss` is None, but must be one of 'cgp', 'qgp'"):
             model.train_policy()
         with pytest.raises(ValueError, match="`max_steps` is 0"):
             make_model().train_policy(max_steps=0)

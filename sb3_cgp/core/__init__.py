@@ -1,1 +1,1 @@
-"""Algorithms 1 and 2 of the paper, and nothing else."""
+"""The paper's method: Algorithms 1 and 2, and the offline training of a policy."""

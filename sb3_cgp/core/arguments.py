@@ -9,7 +9,7 @@ from sb3_cgp.common.spaces import check_action_space
 
 def check_cem(iterations: Any, samples: Any, elites: Any, result: Any, prefix: str = "") -> None:
     """
-    Check the arguments of the Cross-Entropy Method; ``prefix`` is that of their names in an error.
+    Check the arguments of the Cross-Entropy Method; ``prefix`` precedes their names in errors.
 
     :raises ValueError: naming the first argument that breaks a rule
     """

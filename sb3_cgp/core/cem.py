@@ -74,12 +74,13 @@ class CEM:
         """
         Maximise ``score`` for each state by Algorithm 1, with random numbers of PyTorch's global generator.
 
-        The parameters are those of :class:`ActionSelector`. A NaN score ranks below every score that is a number.
+        The parameters are those of :class:`ActionSelector`. A NaN score ranks last, as `topk` would
+        rank it first.
 
         :return: the selected actions (B, A) and the last elites (B, K, A)
         """
         shape = (n_states, self.samples, action_dim)
-        # The first Gaussian has mean 0 and standard deviation 1
+        # The first Gaussian has mean 0 and standard deviation 1 (the text of Section 3.1 says mean 1, Algorithm 1 says 0)
         samples = th.randn(shape, device=device)
         elites = self._select_elites(score, samples)
         for _ in range(self.iterations - 1):

@@ -28,11 +28,11 @@ SelfCGP = TypeVar("SelfCGP", bound="CGP")
 
 class CGP(OffPolicyAlgorithm):
     """
-    Cross-Entropy Guided Policies (CGP): the algorithm of the paper, without the wings of :class:`sb3_cgp.CGP`.
+    Cross-Entropy Guided Policies (CGP), the paper's algorithm: the base of :class:`sb3_cgp.CGP`.
     Learns Q-functions by TD3's objective, with actions picked by the Cross-Entropy Method (CEM), and distils CEM into
     an actor that acts at inference for the price of one forward pass.
 
-    Paper: https://arxiv.org/abs/1903.10605 (Algorithms 1 and 2; the defaults are Appendix B's)
+    Paper: https://arxiv.org/abs/1903.10605 (Algorithms 1 and 2; the defaults follow Appendices A and B)
     The arguments that are not listed are those of SB3's ``OffPolicyAlgorithm``.
 
     :param learning_rate: learning rate of the critics: a number, a function of the progress remaining (from 1 to 0), or a
@@ -46,8 +46,8 @@ class CGP(OffPolicyAlgorithm):
     :param policy_loss: the actor's loss: "cgp" imitates CEM, "qgp" follows the critic's gradient,
         None trains no actor, so that CEM acts at inference too
     :param policy_training: "online" trains the actor along with the critics, "offline" at the end of ``learn``
-    :param inference: what ``predict`` asks: the "actor", the "averaged_actor" (φ' of Algorithm 2) or "cem". None stands for
-        the actor. CEM acts while training, and wherever there is no trained actor.
+    :param inference: what ``predict`` uses: the "actor", the "averaged_actor" (φ' of Algorithm 2) or "cem". None stands for
+        the actor. Rollouts always use CEM, and so does ``predict`` where no actor is trained.
     :param actor_learning_rate: learning rate of the actor, in the same forms. None stands for ``learning_rate``.
     :param policy_delay: The actor is updated once every ``policy_delay`` gradient steps
     :param target_update_interval: The target critics and the averaged actor are updated once every
@@ -72,9 +72,9 @@ class CGP(OffPolicyAlgorithm):
         policy: str | type[CGPPolicy],
         env: GymEnv | str,
         learning_rate: float | Schedule | str = 1e-3,
+        *,
         learning_starts: int = 10_000,
         batch_size: int = 128,
-        *,
         cem_iterations: int = 2,
         cem_samples: int = 64,
         cem_elites: int = 6,
@@ -112,8 +112,9 @@ class CGP(OffPolicyAlgorithm):
         self.target_update_interval = target_update_interval
         self.target_policy_noise = target_policy_noise
         self.target_noise_clip = target_noise_clip
-        # In offline training: the actor has been trained; the critics have learnt since
+        # Whether the actor has been trained, online or offline
         self._policy_is_trained = False
+        # Whether the critics have learnt since the last offline training of the policy
         self._policy_is_due = False
 
         if _init_setup_model:
@@ -129,7 +130,7 @@ class CGP(OffPolicyAlgorithm):
         return self._actor_lr_schedule or self.lr_schedule
 
     def _setup_model(self) -> None:
-        # Here and not in the constructor, which `load` bypasses
+        # Not in the constructor: `load` sets the saved arguments after it, and calls this method then
         check_arguments(self, tuple(POLICY_LOSSES))
         require(issubclass(self.policy_class, CGPPolicy), "policy", self.policy_class, "a subclass of sb3_cgp.CGPPolicy")
         super()._setup_model()
@@ -140,9 +141,9 @@ class CGP(OffPolicyAlgorithm):
         self._choose_inference()
 
     def _choose_inference(self) -> None:
-        """Let ``predict`` ask the network that the user chose, or CEM while there is no trained actor."""
-        has_actor = self._trains_online or self._policy_is_trained
-        self.policy.inference = (self.inference or "actor") if has_actor else "cem"
+        """Let ``predict`` use the network that the user chose, or CEM while no actor is trained."""
+        uses_actor = self._trains_online or (self.policy_loss is not None and self._policy_is_trained)
+        self.policy.inference = (self.inference or "actor") if uses_actor else "cem"
 
     @property
     def _trains_online(self) -> bool:
@@ -151,13 +152,13 @@ class CGP(OffPolicyAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        # CEM acts in rollouts; SB3 asks `predict`, by which the actor answers the user and the callbacks
+        # SB3 selects rollout actions by `predict`, which uses the actor for the user and the callbacks
         with self.policy.acting_by("cem"):
             return super()._sample_action(learning_starts, action_noise, n_envs)
 
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
         """
-        Do gradient steps ("Train on replay buffer" of Algorithm 2).
+        Update the critics, the actor and their averages ("Train on replay buffer" of Algorithm 2).
 
         :param gradient_steps: number of gradient steps
         :param batch_size: number of transitions in a minibatch, b
@@ -167,7 +168,7 @@ class CGP(OffPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rates(self._current_progress_remaining, "critic", "actor")
 
-        losses = defaultdict(list)
+        values = defaultdict(list)
         for _ in range(gradient_steps):
             self._n_updates += 1
             # Sample a minibatch
@@ -191,24 +192,25 @@ class CGP(OffPolicyAlgorithm):
             current_q_values = self.critic(batch.observations, batch.actions)
             critic_loss = th.stack([F.mse_loss(q_values, target_q_values) for q_values in current_q_values]).sum()
             self._descend("critic", critic_loss)
-            losses["critic_loss"].append(critic_loss.detach())
-            losses["q_value"].append(current_q_values[0].detach().mean())
+            values["critic_loss"].append(critic_loss.detach())
+            values["q_value"].append(current_q_values[0].detach().mean())
 
             # Update the policy: as in TD3, its loss sees the updated critic
             if self._trains_online and self._n_updates % self.policy_delay == 0:
                 assert self.policy_loss is not None
                 actor_loss = POLICY_LOSSES[self.policy_loss](self.policy, batch.observations)
                 self._descend("actor", actor_loss)
-                losses["actor_loss"].append(actor_loss.detach())
+                self._policy_is_trained = True
+                values["actor_loss"].append(actor_loss.detach())
 
-            # Update the target critics and the averaged actor
+            # Update the target critics and the averaged actor, every second step by default (Appendix B)
             if self._n_updates % self.target_update_interval == 0:
                 update_average(self.critic, self.critic_target, self.tau)
                 update_average(self.actor, self.actor_target, self.tau)
 
         self._policy_is_due = self.policy_training == "offline"
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self._record_losses(losses)
+        self._record_means(values)
 
     def _update_learning_rates(self, progress_remaining: float, *names: str) -> None:
         """Set the learning rates of the "critic" or the "actor" by their schedules."""
@@ -225,10 +227,10 @@ class CGP(OffPolicyAlgorithm):
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
 
-    def _record_losses(self, losses: dict[str, list[th.Tensor]]) -> None:
-        """Log the means of losses, given by their keys in the log."""
-        for name, values in losses.items():
-            self.logger.record(f"train/{name}", th.stack(values).mean().item())
+    def _record_means(self, values: dict[str, list[th.Tensor]]) -> None:
+        """Log the means of scalars over gradient steps, given by their keys in the log without "train/"."""
+        for name, scalars in values.items():
+            self.logger.record(f"train/{name}", th.stack(scalars).mean().item())
 
     def learn(
         self: SelfCGP,
@@ -239,14 +241,10 @@ class CGP(OffPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfCGP:
-        """
-        Learn the Q-functions, and the policy: along with them or, offline, at the end (see :meth:`train_policy`).
-
-        :return: the trained model; the parameters are those of SB3's ``learn``
-        """
+        """Learn as SB3's algorithms do, and train the policy at the end if its training is offline (:meth:`train_policy`)."""
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        # Without a gradient step of the critics, the policy has nothing new to learn
-        if self._policy_is_due:
+        # Only if the critics have changed. A loaded model has no buffer if a callback stopped `learn` at its first step.
+        if self._policy_is_due and self.replay_buffer is not None and self.replay_buffer.size() > 0:
             self.train_policy(callback=callback, progress_bar=progress_bar)
         return self
 
@@ -260,27 +258,20 @@ class CGP(OffPolicyAlgorithm):
         """
         Train the policy to convergence on the critics and the replay buffer as they are (the paper's offline training).
 
-        It has converged when the loss, averaged over rounds of 1,000 gradient steps, has not fallen below its lowest
-        value by more than 5 % for 5 rounds in a row. ``learn`` calls it in offline training; call it yourself on a
-        loaded model with a loaded replay buffer. Callbacks see each gradient step as a step in which no environment moves.
-        A callback that stops the training within the first round leaves CEM to act.
-
-        :param max_steps: largest number of gradient steps
-        :param batch_size: observations per gradient step, by default the model's
-        :param callback: callback(s) called at every gradient step; the training stops when one returns False
-        :param progress_bar: Display a progress bar using tqdm and rich.
-        :return: the model, whose ``predict`` then asks the network that ``inference`` names
-        :raises ValueError: if there is no policy loss or no data
+        The parameters and the convergence rule are described at :meth:`sb3_cgp.CGP.train_policy`.
         """
         require_count("max_steps", max_steps)
-        require(self.policy_loss is not None, "policy_loss", self.policy_loss, "'cgp' or 'qgp' to train a policy")
+        allowed = f"one of {', '.join(map(repr, POLICY_LOSSES))} to train a policy"
+        require(self.policy_loss is not None, "policy_loss", self.policy_loss, allowed)
+        allowed = "False to train a policy apart: a shared extractor would change the critics"
+        require(not self.policy.share_features_extractor, "share_features_extractor", True, allowed)
         buffer, batch_size = self.replay_buffer, self.batch_size if batch_size is None else batch_size
         require_count("batch_size", batch_size)
         is_filled = buffer is not None and buffer.size() > 0
         require(is_filled, "replay_buffer", buffer, "filled, by `learn` or `load_replay_buffer`")
         assert buffer is not None and self.policy_loss is not None  # noqa: PT018
         if not hasattr(self, "_logger"):
-            # A loaded model that has not learnt yet
+            # No `learn` has configured it, as in a loaded model
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "CGP", reset_num_timesteps=False)
 
         plateau, losses, was_trained = offline.Plateau(), [], self._policy_is_trained
@@ -292,8 +283,9 @@ class CGP(OffPolicyAlgorithm):
             callback = with_progress_bar(callback) if progress_bar else callback
             callback.on_training_start(learn_locals(self, callback, max_steps, progress_bar), globals())
             for n_steps in range(1, max_steps + 1):
-                # Callbacks may have evaluated the policy
+                # Callbacks may have evaluated the policy. Batch norm of the critics keeps its statistics.
                 self.policy.set_training_mode(True)
+                self.critic.set_training_mode(False)
                 self._update_learning_rates(1.0 - (n_steps - 1) / max_steps, "actor")
                 observations = buffer.sample(batch_size, env=self._vec_normalize_env).observations
                 loss = POLICY_LOSSES[self.policy_loss](self.policy, observations)
@@ -305,7 +297,8 @@ class CGP(OffPolicyAlgorithm):
                 if not callback.on_step():
                     break
                 if n_steps % offline.ROUND == 0:
-                    self._record_losses({"actor_loss": losses})
+                    self._record_means({"actor_loss": losses})
+                    # The log's axis continues after the environment steps
                     self.logger.dump(self.num_timesteps + n_steps)
                     if plateau.reached(th.stack(losses).mean().item()):
                         break
@@ -314,7 +307,10 @@ class CGP(OffPolicyAlgorithm):
                 warnings.warn(
                     f"The policy's loss has not reached a plateau in max_steps={max_steps} gradient steps.", stacklevel=2
                 )
+            # An actor that a callback stopped within its first round is of no use
             was_trained = was_trained or n_steps >= min(offline.ROUND, max_steps)
+            if not was_trained:
+                warnings.warn(f"A callback stopped the policy's training after {n_steps} steps: CEM acts.", stacklevel=2)
             self._policy_is_due = False
         finally:
             self._policy_is_trained = was_trained

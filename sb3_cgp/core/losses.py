@@ -14,7 +14,7 @@ from sb3_cgp.core.policies import CGPPolicy
 
 
 def cgp_loss(policy: CGPPolicy, observations: PyTorchObs) -> th.Tensor:
-    """Return the mean squared error of the actor that imitates CEM, ``(π(s) - π_CEM(s))²`` ("CGP loss" of Algorithm 2)."""
+    """Return the mean squared error between the actor's actions and CEM's, ``(π(s) - π_CEM(s))²`` ("CGP loss")."""
     return F.mse_loss(policy.actor(observations), policy.select_actions(observations, policy.critic).actions)
 
 

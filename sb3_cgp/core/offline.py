@@ -2,7 +2,7 @@
 
 import math
 
-# Gradient steps between two looks at the loss
+# Gradient steps per round. The paper says "to convergence": the rule and its numbers are this package's choice.
 ROUND = 1_000
 
 

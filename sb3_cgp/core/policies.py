@@ -46,7 +46,7 @@ class CGPPolicy(TD3Policy):
     :param net_arch: The specification of the policy and value networks, two hidden layers of 256 units by default.
     :param selector: Selects the actions that the critic rates highest. None stands for the algorithm's CEM. Another
         selector needs the one method of :class:`~sb3_cgp.core.cem.ActionSelector`.
-    :param inference: What ``predict`` asks: the "actor", the "averaged_actor" or "cem" (the selector)
+    :param inference: What ``predict`` uses: the "actor", the "averaged_actor" or "cem" (the selector)
     :param kwargs: the further arguments of SB3's ``TD3Policy``, such as ``activation_fn`` and ``n_critics``
     :raises ValueError: if ``inference`` is not one of these
     """
@@ -103,7 +103,7 @@ class CGPPolicy(TD3Policy):
 
     @contextmanager
     def acting_by(self, inference: str) -> Iterator[None]:
-        """Let ``predict`` ask the "actor", the "averaged_actor" or "cem" (the selector) within a ``with`` block."""
+        """Let ``predict`` use the "actor", the "averaged_actor" or "cem" (the selector) within a ``with`` block."""
         usual, self.inference = self.inference, inference
         try:
             yield

@@ -204,12 +204,12 @@ class CudaGraphAlgorithm(CGP):
         # The core's own: a guard in between would read the loss on the host
         CGP._descend(self, name, loss)
 
-    def _record_losses(self, losses: dict[str, list[th.Tensor]]) -> None:
+    def _record_means(self, values: dict[str, list[th.Tensor]]) -> None:
         if self._step_losses is not None:
-            self._step_losses.update(losses)
+            self._step_losses.update(values)
             return
         self._report()
-        super()._record_losses(losses)
+        super()._record_means(values)
 
     def _report(self) -> None:
         """
@@ -220,7 +220,7 @@ class CudaGraphAlgorithm(CGP):
         if self._records_steps:
             self._loss_watch.check()
             unlogged, self._unlogged = self._unlogged, {}
-            super()._record_losses(unlogged)
+            super()._record_means(unlogged)
 
     def dump_logs(self) -> None:
         """
