@@ -8,9 +8,15 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from sb3_cgp.common.extras import import_from_extra
+
+# The processes of a SubprocVecEnv import this module as Python's main module, and need rl_zoo3's patch of Gymnasium's
+# TimeLimit as they do in `rl_zoo3.train`. `resume` reports that rl_zoo3 is missing.
+with suppress(ImportError):
+    import rl_zoo3  # noqa: F401
 
 
 def resume(folder: Path) -> None:
