@@ -224,6 +224,8 @@ class CGP(
         :raises ValueError: if there is no policy loss or no data, if observations are not normalised and the critics have
             learnt from normalised ones, or if a loss is NaN or infinite
         """
+        allowed = "None: call `learn`, which resumes the interrupted training, before `train_policy`"
+        require(self.resumption is None, "resumption", "a loaded state", allowed)
         with self.as_training(), self._explaining_errors():
             self._check_normalisation()
             return super().train_policy(max_steps, batch_size, callback, progress_bar)

@@ -459,6 +459,39 @@ def test_n_step_returns_obey_the_arguments_of_load(tmp_path):
     assert loaded.replay_buffer.gamma == 0.25
 
 
+@pytest.mark.parametrize(
+    ("saved", "loaded", "message"),
+    [
+        (dict(), dict(n_steps=3), "`replay_buffer` is 'ReplayBuffer', but must be a NStepReplayBuffer"),
+        (dict(n_steps=3), dict(n_steps=1), "`replay_buffer` is 'NStepReplayBuffer', but must be a ReplayBuffer"),
+        (
+            dict(replay_buffer_kwargs=dict(handle_timeout_termination=False)),
+            dict(optimize_memory_usage=True),
+            "`replay_buffer.optimize_memory_usage` is False, but must be True",
+        ),
+        (
+            dict(),
+            dict(replay_buffer_kwargs=dict(handle_timeout_termination=False)),
+            "`replay_buffer.handle_timeout_termination` is True, but must be False",
+        ),
+    ],
+    ids=str,
+)
+def test_a_loaded_buffer_that_contradicts_the_arguments_is_refused(saved, loaded, message, tmp_path):
+    model = make_model(**saved).learn(60)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    other = CGP.load(tmp_path / "model", gym.make("Pendulum-v1"), **loaded)
+    with pytest.raises(ValueError, match=message):
+        other.load_replay_buffer(tmp_path / "buffer")
+    # It learns with a buffer of its own
+    assert other.replay_buffer is None
+    other.learn(60)
+    same = CGP.load(tmp_path / "model", gym.make("Pendulum-v1"))
+    same.load_replay_buffer(tmp_path / "buffer")
+    assert same.learn(10, reset_num_timesteps=False).replay_buffer.pos == 70
+
+
 def test_what_sb3_chooses_is_not_stored_in_the_arguments(tmp_path):
     kwargs = {}
     model = make_model(n_steps=3, replay_buffer_kwargs=kwargs)

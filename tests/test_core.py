@@ -101,8 +101,9 @@ def test_the_core_takes_every_argument_of_the_whole_that_is_not_a_wings():
 
 
 def test_the_core_is_read_in_a_sitting():
-    folder = Path(cgp.__file__).parent
-    assert sum(len(path.read_text().splitlines()) for path in folder.glob("*.py")) <= 700
+    # 700 lines, of which 28 are the paper's two losses: a loss of one's own may be added to those
+    files = [path for path in Path(cgp.__file__).parent.glob("*.py") if path.name != "losses.py"]
+    assert sum(len(path.read_text().splitlines()) for path in files) <= 672
 
 
 @pytest.mark.slow

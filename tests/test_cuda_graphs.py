@@ -50,7 +50,7 @@ VARIANTS = {
 
 
 class StandIn:
-    """Does what a recording does, by calling the function."""
+    """Does what a recording does, by calling the function; Python's part of it has no effect, as in a replay."""
 
     made = 0
 
@@ -68,7 +68,13 @@ class StandIn:
         for recorded, new in zip(self.inputs, inputs, strict=True):
             if recorded is not None:
                 recorded.copy_(new)
-        return cuda_graphs.clone_all(self.function(*self.inputs))
+        model = getattr(self.function, "__self__", None)
+        attributes = {} if model is None else dict(vars(model))
+        outputs = cuda_graphs.clone_all(self.function(*self.inputs))
+        if model is not None:
+            vars(model).clear()
+            vars(model).update(attributes)
+        return outputs
 
 
 @pytest.fixture
@@ -254,6 +260,36 @@ def test_a_training_state_has_the_losses_of_recorded_steps_in_its_log(stand_in):
     model.train(1, 16)
     with pytest.raises(ValueError, match="The critic loss was NaN or infinite at gradient step 32"):
         model.get_training_state()
+
+
+def test_a_policy_is_trained_offline_after_every_training_of_its_critics(stand_in):
+    model = make_model(policy_training="offline").learn(80)
+    calls = []
+    model.train_policy = lambda **kwargs: calls.append(kwargs)
+    assert model._policy_is_due is False
+    model.learn(80, reset_num_timesteps=False)
+    assert len(calls) == 1
+
+
+def test_a_nan_loss_is_checked_every_hundred_steps(stand_in):
+    model = make_model().learn(60)
+    model.replay_buffer.rewards[:] = np.nan
+    with pytest.raises(ValueError, match="critic loss was NaN or infinite at gradient step 31"):
+        model.train(200, 16)
+    assert model._n_updates == 230
+    # Over several calls, too
+    for _ in range(69):
+        model.train(1, 16)
+    with pytest.raises(ValueError, match="critic loss was NaN or infinite at gradient step 231"):
+        model.train(1, 16)
+
+
+def test_a_nan_in_the_offline_training_is_raised_at_once(stand_in):
+    model = make_model().learn(60)
+    with th.no_grad():
+        model.actor.mu[0].weight.fill_(th.nan)
+    with pytest.raises(ValueError, match="The actor loss is nan"):
+        model.train_policy(max_steps=5)
 
 
 def test_guards_see_trainings_whose_steps_are_all_replayed(stand_in):

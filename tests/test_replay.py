@@ -111,6 +111,13 @@ def test_vec_normalize_normalises_what_was_observed_to_the_bit(env_class):
     assert all((normalised.astype(np.float32) == row).all(axis=1).any() for row in batch)
 
 
+def test_normalisation_that_comes_when_there_are_rows_warns_of_what_they_have_lost():
+    model = make_model(DummyVecEnv([FarFromZero])).learn(30)
+    model.set_env(VecNormalize(DummyVecEnv([FarFromZero])))
+    with pytest.warns(UserWarning, match="The replay buffer has observations in float32, and `env` normalises them now"):
+        model.learn(5)
+
+
 def test_normalisation_that_comes_or_goes_later_is_stored_accordingly():
     plain, normalising = DummyVecEnv([FarFromZero]), VecNormalize(DummyVecEnv([FarFromZero]))
     rewards_only = VecNormalize(DummyVecEnv([FarFromZero]), norm_obs=False)

@@ -16,6 +16,8 @@ from sb3_cgp.fast.recorded_optimizers import LossWatch, is_fused_adam, set_captu
 
 SelfCudaGraphAlgorithm = TypeVar("SelfCudaGraphAlgorithm", bound="CudaGraphAlgorithm")
 
+# Gradient steps between two checks of the losses, each of which synchronizes with the GPU
+CHECK_INTERVAL = 100
 # Keys of the losses in the log, in the order in which a recorded step returns them
 LOSSES = ("critic_loss", "q_value", "actor_loss")
 # Attributes that hold graphs or tensors on the device, and are made anew for a copied or loaded model
@@ -108,6 +110,7 @@ class CudaGraphAlgorithm(CGP):
 
         :param gradient_steps: number of gradient steps
         :param batch_size: number of transitions in a minibatch
+        :raises ValueError: if a loss was NaN or infinite
         """
         if not self._records_steps:
             super().train(gradient_steps, batch_size)
@@ -115,7 +118,7 @@ class CudaGraphAlgorithm(CGP):
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
         self._update_learning_rates(self._current_progress_remaining, "critic", "actor")
-        losses = defaultdict(list)
+        losses, n_updates_before = defaultdict(list), self._n_updates
         for _ in range(gradient_steps):
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             n_updates = self._n_updates + 1
@@ -128,6 +131,11 @@ class CudaGraphAlgorithm(CGP):
                     losses[name].append(loss)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._unlogged.update(losses)
+        # The core's `train` sets these two, which no replay does
+        self._policy_is_trained |= "actor_loss" in losses
+        self._policy_is_due = self.policy_training == "offline"
+        if self._n_updates // CHECK_INTERVAL > n_updates_before // CHECK_INTERVAL:
+            self._loss_watch.check()
 
     def _carry_out(self, *fields: th.Tensor) -> Tensors:
         """Run the core's ``train`` for one gradient step on a minibatch, and return its losses."""
@@ -197,10 +205,13 @@ class CudaGraphAlgorithm(CGP):
                 group["lr"] = self._recorded_rates[name]
 
     def _descend(self, name: str, loss: th.Tensor) -> None:
-        if not self._records_steps:
+        optimizer = getattr(self, name).optimizer
+        if self._step_losses is None:
+            # Not recorded, as in the policy's offline training
+            skip_step_if(optimizer, None)
             super()._descend(name, loss)
             return
-        skip_step_if(getattr(self, name).optimizer, self._loss_watch.see(name, loss))
+        skip_step_if(optimizer, self._loss_watch.see(name, loss))
         # The core's own: a guard in between would read the loss on the host
         CGP._descend(self, name, loss)
 
@@ -261,7 +272,9 @@ class CudaGraphAlgorithm(CGP):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._prepare_graphs()
+        # Without `_init_setup_model` there are no networks yet
+        if "actor" in state:
+            self._prepare_graphs()
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *TRANSIENT]

@@ -33,14 +33,13 @@ def leaves_room(observation_space: spaces.Space, buffer_size: int, device: th.de
     """
     Return whether a :class:`DeviceReplayBuffer` leaves enough of the GPU's memory free.
 
-    :param observation_space: observation space, a ``Box``
+    :param observation_space: observation space, a ``Box``, with the data type in which observations are stored
     :param buffer_size: number of transitions
     :param device: a GPU
     :return: whether its observations, by far the largest part, take at most half of the free memory
     """
     assert isinstance(observation_space, spaces.Box)
-    # Floating point numbers are stored in float32 at most
-    needed = 2 * buffer_size * int(np.prod(observation_space.shape)) * min(observation_space.dtype.itemsize, 4)
+    needed = 2 * buffer_size * int(np.prod(observation_space.shape)) * observation_space.dtype.itemsize
     free, _ = th.cuda.mem_get_info(device)
     return needed <= free / 2
 

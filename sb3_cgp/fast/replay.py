@@ -8,12 +8,16 @@ from typing import Any, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_cgp.common.rules import require
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer, fits_device, leaves_room
+
+SB3_BUFFERS = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer)
 
 SelfLeanReplayAlgorithm = TypeVar("SelfLeanReplayAlgorithm", bound="LeanReplayAlgorithm")
 
@@ -75,7 +79,7 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         choice = (self._buffer_class, self.observation_space, self.optimize_memory_usage, self.device)
         if not self.cuda_graphs or not fits_device(*choice):
             return self._buffer_class
-        if leaves_room(self.observation_space, self.buffer_size, self.device):
+        if leaves_room(self._stored_space(), self.buffer_size, self.device):
             return DeviceReplayBuffer
         message = f"A replay buffer of {self.buffer_size} takes over half of {self.device}'s free memory"
         warnings.warn(f"{message}: it is kept on the host.", stacklevel=2)
@@ -109,16 +113,54 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         return self.replay_buffer_class is None and issubclass(buffer_class, NStepReplayBuffer)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
-        buffer = self._ensure_replay_buffer()
-        if buffer.size() == 0 and buffer.observation_space != self._stored_space():
+        if self.replay_buffer is not None and self.replay_buffer.observation_space != self._stored_space():
             # `set_env` has added or removed VecNormalize
-            self.replay_buffer = None
-            buffer = self._ensure_replay_buffer()
+            if self.replay_buffer.size() == 0:
+                self.replay_buffer = None
+            elif self._stored_space() == self.observation_space:
+                message = "The replay buffer has observations in float32, and `env` normalises them now: those near their"
+                warnings.warn(
+                    f"{message} mean may have lost their differences. Train a new model to keep these.", stacklevel=2
+                )
+        buffer = self._ensure_replay_buffer()
         if self._chooses_n_step_returns(type(buffer)):
             assert isinstance(buffer, NStepReplayBuffer)
             # A loaded buffer has those of the model that saved it
             buffer.n_steps, buffer.gamma = self.n_steps, self.gamma
         return super()._setup_learn(*args, **kwargs)
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load a replay buffer from a pickle file, as SB3 does, if it is what the model's arguments ask for.
+
+        :param path: Path to the pickled replay buffer.
+        :param truncate_last_traj: When using ``HerReplayBuffer`` with online sampling: whether the last trajectory in the
+            replay buffer was finished
+        :raises ValueError: if the buffer contradicts ``replay_buffer_class``, ``n_steps``, ``optimize_memory_usage`` or
+            ``replay_buffer_kwargs``; the model keeps its own
+        """
+        previous = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        assert self.replay_buffer is not None
+        try:
+            self._check_loaded(self.replay_buffer)
+        except ValueError:
+            self.replay_buffer = previous
+            raise
+
+    def _check_loaded(self, buffer: ReplayBuffer) -> None:
+        """Refuse a loaded buffer whose settings contradict the model's arguments, which it would outrank silently."""
+        assert self._buffer_class is not None
+        kinds = [ReplayBuffer if each is DeviceReplayBuffer else each for each in (type(buffer), self._buffer_class)]
+        # A class of the user's own may do what the arguments ask for
+        fits = kinds[0] is kinds[1] or not set(kinds) <= set(SB3_BUFFERS)
+        allowed = f"a {self._buffer_class.__name__}, by the model's `replay_buffer_class`, `n_steps` and observation space"
+        require(fits, "replay_buffer", type(buffer).__name__, f"{allowed}: load the model with those of the saved one")
+        settings = {"optimize_memory_usage": self.optimize_memory_usage} | self.replay_buffer_kwargs
+        for name, value in settings.items():
+            stored = getattr(buffer, name, value)
+            value = KEY_TO_GOAL_STRATEGY.get(value, value) if isinstance(value, str) else value
+            require(stored == value, f"replay_buffer.{name}", stored, f"{value}, as in the model's arguments")
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """
