@@ -98,7 +98,7 @@ class Prioritised(ReplayBuffer):
 
 
 class Tree(Prioritised):
-    """With a part that is no plain data."""
+    """With a part that is not plain data."""
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)

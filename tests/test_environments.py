@@ -354,7 +354,7 @@ def test_state_that_is_no_plain_data_is_noticed():
     assert environment_state(env) is not None
     env.envs[1].unwrapped.goal = SimpleNamespace()
     assert environment_state(env) is None
-    assert re.fullmatch(r".*PendulumEnv\.goal is namespace\(\), which is no plain data\.", why_not_restorable(env))
+    assert re.fullmatch(r".*PendulumEnv\.goal is namespace\(\), which is not plain data\.", why_not_restorable(env))
     env.envs[1].unwrapped.goal = env.action_space
     assert environment_state(env) is not None
     env.simulator = deque([object()])

@@ -262,7 +262,9 @@ def test_an_environment_that_cannot_be_restored_begins_an_episode(tmp_path):
     training = interrupted(tmp_path, **case)
     model = CGP.resume(tmp_path / "state", training.make_env(5))
     assert model.num_timesteps == 40
-    with pytest.warns(UserWarning, match=r"The environment's state was not saved: .* The training goes on at an episode"):
+    with pytest.warns(
+        UserWarning, match=r"The environment's state was not saved: .* The training continues at the start of a new episode"
+    ):
         training.learn(model, None)
     assert (model.num_timesteps, model._n_updates) == (120, 100)
 

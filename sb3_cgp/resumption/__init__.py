@@ -1,4 +1,4 @@
-"""Resume an interrupted training of any of SB3's off-policy algorithms, to the bit."""
+"""Resume an interrupted training of any of SB3's off-policy algorithms exactly."""
 
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm, resumable
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback

@@ -30,7 +30,7 @@ SelfResumableAlgorithm = TypeVar("SelfResumableAlgorithm", bound="ResumableAlgor
 
 @contextmanager
 def _whole(path: str | Path | io.BufferedIOBase, suffix: str) -> Iterator[Any]:
-    """Open a file to be written as a whole, named as SB3 names it. A file that is open already is yielded as it is."""
+    """Open a file that appears under its name when it is complete. Add the suffix as SB3 does. Yield an open file as it is."""
     if isinstance(path, io.BufferedIOBase):
         yield path
         return
@@ -43,7 +43,7 @@ class ResumableAlgorithm(ResumableModel):
     """
     An algorithm that resumes from the states of a :class:`~sb3_cgp.resumption.callbacks.TrainingCheckpointCallback`.
 
-    It comes first among an algorithm's bases. :func:`resumable` makes one of any of SB3's off-policy algorithms.
+    It must be the first base class of an algorithm. :func:`resumable` derives such a class from an off-policy algorithm.
     """
 
     @classmethod
@@ -97,12 +97,12 @@ class ResumableAlgorithm(ResumableModel):
         model = cls.load(io.BytesIO(state.pop("model")), env, device, force_reset=False, **kwargs)
         assert model.env is not None
         check_fits(model, state)
-        # The same object, as at first: environments may draw from it, too
+        # Model and environment must share the space, as wrappers may draw random actions from it, too
         model.action_space = model.env.action_space
         fill_replay_buffer(model._ensure_replay_buffer(), state.pop("replay_buffer"))
         model.resumption = state | {
             "checkpoint": state["checkpoint"] | {"path": store.folder},
-            # `set_env` would forget them
+            # `set_env` would reset these attributes
             "last": {name: getattr(model, name) for name in ("_last_obs", "_last_episode_starts", "_last_original_obs")},
         }
         model.saved_to = {store.folder: digests}
@@ -115,23 +115,25 @@ class ResumableAlgorithm(ResumableModel):
         include: Iterable[str] | None = None,
     ) -> None:
         """
-        Save all the attributes of the object and the model parameters in a zip-file, which appears as a whole or not at all.
+        Save all the attributes of the object and the model parameters in a zip-file.
+
+        The file is written completely or not at all.
 
         :param path: path to the file where the rl agent should be saved
         :param exclude: name of parameters that should be excluded in addition to the default ones
         :param include: name of parameters that might be excluded but should be included anyway
-        :raises OSError: if it cannot be written; a file that was there is as it was
+        :raises OSError: if it cannot be written; an existing file is then not changed
         """
         with _whole(path, ".zip") as file:
             super().save(file, exclude, include)
 
     def save_replay_buffer(self, path: str | Path | io.BufferedIOBase) -> None:
         """
-        Save the replay buffer as a pickle file, which appears as a whole or not at all.
+        Save the replay buffer as a pickle file, which is written completely or not at all.
 
         :param path: Path to the file where the replay buffer should be saved.
             if path is a str or pathlib.Path, the path is automatically created if necessary.
-        :raises OSError: if it cannot be written; a file that was there is as it was
+        :raises OSError: if it cannot be written; an existing file is then not changed
         """
         with _whole(path, ".pkl") as file:
             super().save_replay_buffer(file)
@@ -150,11 +152,11 @@ class ResumableAlgorithm(ResumableModel):
             return result
         if self.resumption["environment"] is None:
             begin_new_episode(self, self.resumption)
-        # SB3 resets it
+        # SB3 resets the noise
         action_noise = copy.deepcopy(self.action_noise)
         has_logger, folder = self._custom_logger, self.resumption["log_folder"]
         if not has_logger and self.tensorboard_log is not None and folder is not None and os.path.isdir(folder):
-            # SB3 would choose the folder of the newest run
+            # SB3 would continue in the folder of the newest run
             self.set_logger(continued_logger(folder, self.num_timesteps + 1, self.verbose))
         steps_left = self._training_started_at + total_timesteps - self.num_timesteps
         result = super()._setup_learn(steps_left, callback, False, *args, **kwargs)
@@ -165,7 +167,7 @@ class ResumableAlgorithm(ResumableModel):
         callback = super()._init_callback(callback, progress_bar)
         checkpoints = [each for each in iter_callbacks(callback) if isinstance(each, TrainingCheckpointCallback)]
         for each in checkpoints:
-            allowed = "None: give a TrainingCheckpointCallback to `learn` itself, as others do not tell it when a step is over"
+            allowed = "None: give a TrainingCheckpointCallback to `learn` itself. Other callbacks do not report rollouts to it"
             require(each.parent is None, "parent", each.parent, allowed)
         if self.resumption is not None and not checkpoints:
             callback = CallbackList([callback, TrainingCheckpointCallback(**self.resumption["checkpoint"])])
@@ -188,27 +190,24 @@ class ResumableAlgorithm(ResumableModel):
     @contextmanager
     def as_training(self) -> Iterator[None]:
         """
-        Mark a training, which ends here, by an error or not: signals are handled as before, and folders are released.
+        Return a context for a training. At its end, also by an error, signals are handled as before the training.
 
-        ``learn`` is one. A method that calls callbacks without ``learn`` does so within this context. Trainings may be nested.
+        ``learn`` runs within it, and so must any other method that calls callbacks. Contexts may be nested. The outermost one
+        also releases the folders of states, and removes the callbacks from the model.
         """
         self._n_nested_trainings += 1
         try:
             yield
         finally:
             self._n_nested_trainings -= 1
-            self._release_signals()
-
-    def _release_signals(self) -> None:
-        """Restore the handling of signals, end the saving of states, and release what belongs to the outermost training."""
-        for each in () if self.callback is None else iter_callbacks(self.callback):
-            if isinstance(each, TrainingCheckpointCallback):
-                each.release()
-        if self._n_nested_trainings == 0:
-            # A callback holds environments and files, which can often be neither copied nor pickled
-            self.callback = None
-            self._warned_of = frozenset()
-            self.release_folders()
+            for each in () if self.callback is None else iter_callbacks(self.callback):
+                if isinstance(each, TrainingCheckpointCallback):
+                    each.release()
+            if self._n_nested_trainings == 0:
+                # Callbacks hold environments and files, many of which can be neither copied nor pickled
+                self.callback = None
+                self._warned_of = frozenset()
+                self.release_folders()
 
 
 def resumable(algorithm: type[OffPolicyAlgorithm]) -> type[ResumableAlgorithm]:

@@ -19,10 +19,10 @@ def iter_callbacks(callback: BaseCallback) -> list[BaseCallback]:
     List a callback and all callbacks within it.
 
     :param callback: the callback
-    :return: the callbacks, each before those within it, and once
+    :return: the callbacks, without duplicates; each one precedes those within it
     """
     found = [callback]
-    # The list grows while it is read
+    # The loop also visits the callbacks that it appends
     for each in found:
         for value in vars(each).values():
             children = value if isinstance(value, list) else [value]
@@ -63,8 +63,8 @@ def restore_callbacks(callback: BaseCallback, states: list[State]) -> None:
     Restore callbacks, which are identified by their class and order.
 
     :param callback: the callback of the resumed training
-    :param states: what :func:`callback_states` returned
-    :raises ValueError: if an evaluation environment is not the saved one
+    :param states: the states that :func:`callback_states` returned
+    :raises ValueError: if an evaluation environment is not the one whose state was saved
     """
     present: dict[tuple[str, int], BaseCallback] = {}
     seen: Counter[str] = Counter()
@@ -90,8 +90,8 @@ def _restore_callback(callback: BaseCallback, state: State) -> None:
         set_plain_attributes(callback, state["attributes"])
     for attribute, environment in state["environments"].items():
         if environment is None:
-            name = f"{state['class']}'s `{attribute}`"
-            warnings.warn(f"The state of {name} was not saved: its episodes differ from those without a stop.", stacklevel=2)
+            message = f"The state of {state['class']}'s `{attribute}` was not saved: its episodes will be other ones."
+            warnings.warn(message, stacklevel=2)
         elif isinstance(getattr(callback, attribute, None), VecEnv):
             restore_environment(getattr(callback, attribute), environment)
 

@@ -1,4 +1,4 @@
-"""A callback that saves the whole training state, so that an interrupted training can be resumed."""
+"""A callback that saves the complete training state, so that an interrupted training can be resumed."""
 
 import os
 import signal
@@ -18,16 +18,18 @@ from sb3_cgp.resumption.store import StateStore
 
 class TrainingCheckpointCallback(BaseCallback):
     """
-    Save the whole training state periodically, and when the training ends, for :meth:`ResumableAlgorithm.resume`.
+    Save the complete training state periodically, and when the training ends, for :meth:`ResumableAlgorithm.resume`.
 
-    SB3 calls callbacks in the middle of a step. A state that is due is saved before the next rollout starts, when the step is
-    over. At the end of a training without rollouts, such as CGP's offline training of a policy, a state is saved, too.
+    SB3 calls ``on_step`` before it has stored the transition and taken the gradient steps. A state that is due is therefore
+    saved when the next rollout starts. A state is also saved at the end of a training without rollouts, such as CGP's
+    offline training of a policy.
 
-    On SIGTERM, which a cluster's scheduler sends, the state is saved as soon as the step is over, and the process exits with
-    status 143 (in a training without rollouts at once: the state at its start was saved). A second SIGTERM acts as it would
-    without this callback. Of several such callbacks, the first one handles the signal.
+    On SIGTERM, which a cluster's scheduler sends, the state is saved when the next rollout would start, and the process exits
+    with status 143. A training without rollouts exits at its next step without saving, as the state at its start was saved.
+    A second SIGTERM has the effect that it has without this callback. Of several such callbacks, the first one handles the
+    signal.
 
-    The folder belongs to one training at a time. It is locked from ``resume``, or the start of ``learn``, to ``learn``'s end.
+    One training at a time can use the folder. It is locked from ``resume``, or the start of ``learn``, until ``learn`` ends.
 
     :param save_freq: environment steps between two states, those of all environments together
     :param path: the folder for the states. With None, nothing is saved, except in rl_zoo3, where it stands for the
@@ -53,7 +55,7 @@ class TrainingCheckpointCallback(BaseCallback):
         self._rollout_is_over = False
         self._is_in_rollouts = False
         self._has_trained_without_rollouts = False
-        # `learn` may end in the middle of a step, and a training without rollouts follow
+        # `learn` may end in the middle of a step, and a training without rollouts may follow
         self._is_within_step = False
         self._previous_handler: Any = None
         self._watching_process = 0
@@ -67,7 +69,7 @@ class TrainingCheckpointCallback(BaseCallback):
     @path.setter
     def path(self, path: str | Path | None) -> None:
         self._path = path
-        # Now, as the process may change its working directory
+        # Resolved now, as the process may change its working directory
         self._folder = Path("" if path is None else path).resolve()
 
     @property
@@ -86,7 +88,7 @@ class TrainingCheckpointCallback(BaseCallback):
         self.model.hold_folder(self._folder)
         known = self.model.saved_to.get(self._folder, frozenset())
         is_another = not self._store.digests() <= known
-        allowed = "a folder without the states of another training: go on with that by `resume`, or choose another"
+        allowed = "a folder without the states of another training: continue that one by `resume`, or choose another folder"
         require(not is_another, "path", str(self.path), allowed)
         self._watch_for_termination()
 
@@ -119,13 +121,13 @@ class TrainingCheckpointCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._restore_if_resumed()
-        # A callback may have ended the training in the middle of a step; rl_zoo3 calls this twice, and after an error
+        # A callback may have ended the training in the middle of a step. rl_zoo3 calls this method twice, and after errors.
         is_whole = self._rollout_is_over or (self._has_trained_without_rollouts and not self._is_within_step)
         self._rollout_is_over = self._has_trained_without_rollouts = False
         if self.path is not None and is_whole:
             self._save()
         self._restore_handler()
-        # SIGTERM came during the last step or its saving: the code after `learn` could take as long as the training
+        # SIGTERM came during the last step or the saving of its state. The code after `learn` could take too long.
         if self._is_asked_to_stop:
             self._stop()
 
@@ -141,7 +143,7 @@ class TrainingCheckpointCallback(BaseCallback):
         """
         Restore the counters.
 
-        :param state: what :meth:`get_training_state` returned
+        :param state: the counters that :meth:`get_training_state` returned
         """
         self.n_calls, self.num_timesteps = state["n_calls"], state["num_timesteps"]
 
@@ -167,7 +169,7 @@ class TrainingCheckpointCallback(BaseCallback):
         self._is_asked_to_stop = False
         handler = signal.getsignal(signal.SIGTERM)
         is_watched = isinstance(getattr(handler, "__self__", None), TrainingCheckpointCallback)
-        # Python allows it in the main thread only, and a handler that is not Python's (None) could not be restored
+        # Python sets handlers in the main thread only, and could not restore a handler that is not its own (None)
         if threading.current_thread() is threading.main_thread() and handler is not None and not is_watched:
             self._watching_process = os.getpid()
             self._previous_handler = signal.signal(signal.SIGTERM, self._note_termination)
@@ -177,7 +179,7 @@ class TrainingCheckpointCallback(BaseCallback):
         if os.getpid() == self._watching_process:
             self._is_asked_to_stop = True
         else:
-            # A process that was forked during the training, as by a simulator, ends as it would without this callback
+            # This process was forked during the training, by a simulator for example: the signal has its usual effect
             os.kill(os.getpid(), number)
 
     def _stop(self) -> NoReturn:
@@ -185,7 +187,7 @@ class TrainingCheckpointCallback(BaseCallback):
         raise SystemExit(128 + signal.SIGTERM)
 
     def release(self) -> None:
-        """Restore the handling of SIGTERM, and save no state until the next training starts, as this one may have failed."""
+        """Restore the handler of SIGTERM. Save no state until the next training starts, as this one may have failed."""
         self._rollout_is_over = self._has_trained_without_rollouts = False
         self._restore_handler()
 

@@ -23,7 +23,7 @@ class Encoder:
     def __init__(self, write_block: Callable[[memoryview], str]):
         self._write_block = write_block
         self._small = bytearray()
-        # References to small arrays, whose block is not written yet
+        # References to small arrays whose block has not been written
         self._waiting: list[dict[str, Any]] = []
 
     def encode(self, value: Any, place: str) -> Any:
@@ -33,7 +33,7 @@ class Encoder:
         :param value: the value
         :param place: its place in the state, for the error
         :return: data that JSON can hold
-        :raises TypeError: if the value, or a part of it, is no plain data
+        :raises TypeError: if the value, or a part of it, is not plain data
         """
         if value is None or type(value) in (bool, int, str):
             return value

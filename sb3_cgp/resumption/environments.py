@@ -1,7 +1,7 @@
 """
-The whole state of an environment. A restored environment continues as the saved one, to the bit.
+The complete state of an environment. A restored environment returns exactly what the saved one would have returned.
 
-These are restorable:
+These environments and wrappers can be restored:
 
 - Gymnasium's classic control and MuJoCo tasks (of models without plugins, flexible bodies and sleep),
 - the wrappers of Gymnasium, of ``rl_zoo3.wrappers`` and of ``sb3_contrib.common.wrappers``, and SB3's ``Monitor``,
@@ -70,7 +70,7 @@ class RestorableEnv(gym.Wrapper):
 
 def environment_state(env: VecEnv) -> dict[str, Any] | None:
     """
-    Copy the whole state of a vectorised environment, its wrappers and its environments.
+    Copy the complete state of a vectorised environment, its wrappers and its environments.
 
     :param env: the environment, between two steps
     :return: plain data (see :func:`~sb3_cgp.resumption.plain_data.to_plain`), or None if the environment cannot be restored
@@ -106,16 +106,16 @@ def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
     """
     Restore the state of a vectorised environment in another one that was made in the same way.
 
-    It need not have been reset. From then on both return the same observations, rewards, ends of episodes and infos for
-    the same actions and start later episodes alike, to the bit. Only the times of the clock differ.
+    The other environment need not have been reset. Given the same actions, both then return exactly the same observations,
+    rewards, ends of episodes and infos, in this and in later episodes. Only wall-clock times differ.
 
     :param env: the environment to change
-    :param state: what :func:`environment_state` returned
-    :raises ValueError: if the state is of another environment; this one is then as it was
+    :param state: the state that :func:`environment_state` returned
+    :raises ValueError: if the state is that of another environment; ``env`` is then not changed
     """
-    there, problems = _state(env)
+    current, problems = _state(env)
     require(not problems, "env", env, f"restorable: {' '.join(dict.fromkeys(problems))}")
-    _require_same(there, state)
+    _require_same(current, state)
     layers = list(_vec_layers(env))
     for layer, saved in zip(layers, state["layers"], strict=True):
         set_layer_state(layer, saved)
@@ -128,7 +128,7 @@ def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
 
 
 def _state(env: VecEnv) -> tuple[dict[str, Any], list[str]]:
-    """Copy the whole state of a vectorised environment, and list the obstacles to restoring it."""
+    """Copy the complete state of a vectorised environment, and list the obstacles to restoring it."""
     problems: list[str] = []
     layers = list(_vec_layers(env))
     states = [layer_state(layer, problems) for layer in layers]
@@ -141,7 +141,7 @@ def _state(env: VecEnv) -> tuple[dict[str, Any], list[str]]:
 
 
 def _states_in_processes(env: SubprocVecEnv, problems: list[str]) -> list[Any]:
-    # `env_method` finds methods through wrappers, but the outermost object's own `__dir__` first of all
+    # `env_method` searches the wrappers, too. Every object has a `__dir__`, so that this call reaches the outermost one.
     if not all("get_chain_state" in names for names in env.env_method("__dir__")):
         problems.append(_remedy_in_processes(env))
         return []
@@ -151,16 +151,16 @@ def _states_in_processes(env: SubprocVecEnv, problems: list[str]) -> list[Any]:
 
 
 def _remedy_in_processes(env: SubprocVecEnv) -> str:
-    """Say what an environment of a SubprocVecEnv needs that has no RestorableEnv outermost."""
+    """Describe the remedy for an environment of a SubprocVecEnv whose outermost wrapper is not RestorableEnv."""
     missing = "An environment of SubprocVecEnv has no RestorableEnv outermost."
     described = env.env_method("__str__")[0]
-    # An environment describes itself as <class<id>>
+    # Gymnasium's description of an environment is <class<id>>
     found = re.search(r"<([^<>]+)<([^<>]+)>", described)
     spec = None if found is None else gym.registry.get(found[2])
     module = spec.entry_point.partition(":")[0] if spec is not None and isinstance(spec.entry_point, str) else ""
     if is_known(module) or all(env.env_method("has_wrapper_attr", "get_training_state")):
         return f"{missing} Make sb3_cgp.resumption.RestorableEnv its outermost wrapper."
-    return f"{missing} RestorableEnv alone would not help: {described} has no {METHODS}, which it needs besides."
+    return f"{missing} RestorableEnv alone would not help: {described} has no {METHODS}, which it needs as well."
 
 
 def _vec_layers(env: VecEnv) -> Iterator[Any]:
@@ -198,18 +198,18 @@ def _set_chain_state(env: gym.Env, state: dict[str, Any]) -> None:
 
 
 def _describe(state: dict[str, Any]) -> str:
-    """Name the classes that an environment is made of, from the outermost to the innermost."""
+    """Name the classes of an environment and its wrappers, from the outermost to the innermost."""
     vectorized, *chains = [" > ".join(layer["class"] for layer in each["layers"]) for each in (state, *state["envs"])]
-    # Most often they are all the same
+    # The environments are usually all of the same classes
     inside = " | ".join(dict.fromkeys(chains)) if len(set(chains)) == 1 else " | ".join(chains)
     return f"{state['num_envs']} x {vectorized}" + (f" > {inside}" if inside else "")
 
 
-def _require_same(there: dict[str, Any], saved: dict[str, Any]) -> None:
-    """Refuse the state of an environment that was made in another way."""
-    is_what = "what the state was saved from"
-    require(_describe(there) == _describe(saved), "env", _describe(there), f"{is_what}, {_describe(saved)!r}")
-    layers = [[layer for each in (state, *state["envs"]) for layer in each["layers"]] for state in (there, saved)]
+def _require_same(current: dict[str, Any], saved: dict[str, Any]) -> None:
+    """Refuse the state of an environment whose classes, spaces or MuJoCo model differ."""
+    origin = "what the state was saved from"
+    require(_describe(current) == _describe(saved), "env", _describe(current), f"{origin}, {_describe(saved)!r}")
+    layers = [[layer for each in (state, *state["envs"]) for layer in each["layers"]] for state in (current, saved)]
     for ours, theirs in zip(*layers, strict=True):
         for part, describe in (
             ("spaces", lambda state: state["space"]),
@@ -217,5 +217,5 @@ def _require_same(there: dict[str, Any], saved: dict[str, Any]) -> None:
         ):
             our, their = ({name: describe(each) for name, each in layer.get(part, {}).items()} for layer in (ours, theirs))
             for name in sorted(our.keys() | their.keys()):
-                allowed = f"{is_what}, {their.get(name)!r}"
+                allowed = f"{origin}, {their.get(name)!r}"
                 require(our.get(name) == their.get(name), f"{ours['class']}.{name}", our.get(name), allowed)

@@ -1,4 +1,4 @@
-"""The state of one environment or wrapper, without what it wraps."""
+"""The state of one environment or wrapper, without the environment that it wraps."""
 
 import io
 from functools import partial
@@ -29,21 +29,21 @@ STATELESS_TYPES = (
     *(BuiltinFunctionType, EnvSpec, FunctionType, MethodType, ModuleType, ResultsWriter, StackedObservations),
     *(io.IOBase, np.dtype, np.ufunc, partial, spaces.Space, type),
 )
-# MuJoCo's model does not change, and its data is saved apart
+# MuJoCo's model does not change; its data is saved separately
 STATELESS_MODULES = ("gymnasium.envs.mujoco.mujoco_rendering.", "mujoco.", "pygame.")
 UNSAVED = {
     # The wrapped environments and stacks, each of which has a state of its own
     *("env", "envs", "venv", "obs_spaces", "sub_stacked_observations"),
-    # The actions of a step that is over
+    # The actions of the last completed step
     "actions",
     # SubprocVecEnv's connections
     *("closed", "processes", "remotes", "waiting", "work_remotes"),
     # Attributes of the class, and the constructor's arguments
     *("class_attributes", "_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "fullpath"),
-    # Rendering, and the time of the clock
+    # Rendering, and wall-clock times
     *("metadata", "render_mode", "frame_list", "recorded_frames", "render_history", "episode_start_time", "t_start"),
 }
-# The infos of the last step may hold anything, and are overwritten before they are read
+# The infos of the last step may hold values of any type; they are overwritten before they are read
 INFOS = {"buf_infos", "reset_infos"}
 RANDOM_STATE = {"_np_random", "_np_random_seed"}
 METHODS = "get_training_state() and set_training_state()"
@@ -51,11 +51,11 @@ METHODS = "get_training_state() and set_training_state()"
 
 def layer_state(layer: Any, problems: list[str]) -> dict[str, Any]:
     """
-    Copy the state of one environment or wrapper, without what it wraps.
+    Copy the state of one environment or wrapper, without the environment that it wraps.
 
     :param layer: the environment or wrapper
     :param problems: a list to which a sentence is appended for each obstacle to restoring the layer
-    :return: plain data, which is complete if no sentence was appended
+    :return: plain data, from which the layer can be restored if no sentence was appended
     :raises ValueError: if ``get_training_state()`` returns anything but plain data
     """
     kind = type(layer)
@@ -83,9 +83,9 @@ def set_layer_state(layer: Any, state: dict[str, Any]) -> None:
     Restore the state of one environment or wrapper.
 
     :param layer: the environment or wrapper
-    :param state: what :func:`layer_state` returned
+    :param state: the state that :func:`layer_state` returned
     """
-    # First, as it may draw random numbers
+    # First, as this method may draw random numbers
     if "own" in state:
         layer.set_training_state(from_plain(state["own"]))
     set_plain_attributes(layer, state["attributes"])
@@ -121,17 +121,17 @@ def _problems(layer: Any, name: str, saved: Any) -> list[str]:
     if not is_known(type(layer).__module__):
         return [f"{name} is unknown and has no get_training_state(): it needs {METHODS}."]
     unsaved = {key: vars(layer)[key] for key in vars(layer).keys() - saved - UNSAVED - INFOS}
-    in_the_way = {key: value for key, value in sorted(unsaved.items()) if not _is_stateless(value)}
-    return [f"{name}.{key} is {value!r}, which is no plain data." for key, value in in_the_way.items()]
+    obstacles = {key: value for key, value in sorted(unsaved.items()) if not _is_stateless(value)}
+    return [f"{name}.{key} is {value!r}, which is not plain data." for key, value in obstacles.items()]
 
 
 def _is_stateless(value: Any) -> bool:
-    """Return whether a value's type holds no state, or a state that is saved apart."""
+    """Return whether values of this type have no state, or a state that is saved separately."""
     return isinstance(value, STATELESS_TYPES) or f"{type(value).__module__}.".startswith(STATELESS_MODULES)
 
 
 def _subspaces(space: spaces.Space) -> list[spaces.Space]:
-    """List the spaces that a space is made of."""
+    """List the spaces within a Dict, Tuple or other composite space."""
     found: list[Any] = []
     for value in vars(space).values():
         found.extend(value.values() if isinstance(value, dict) else value if isinstance(value, tuple | list) else [value])
@@ -140,7 +140,7 @@ def _subspaces(space: spaces.Space) -> list[spaces.Space]:
 
 def _space_state(space: spaces.Space) -> dict[str, Any]:
     """Copy the states of a space's random generators."""
-    # Not `np_random`, which makes a generator where there is none yet
+    # Not the property `np_random`, which would create a missing generator
     random_state = {name: to_plain(value) for name, value in vars(space).items() if name in RANDOM_STATE}
     return {"space": str(space), "attributes": random_state, "inside": [_space_state(each) for each in _subspaces(space)]}
 

@@ -22,7 +22,7 @@ class FolderLock:
     """
     An exclusive lock on a folder of training states.
 
-    The operating system releases it when its process ends, however that happens. A forked process does not inherit it.
+    The operating system releases the lock when the process ends, even if it is killed. A forked process does not hold it.
 
     :param folder: the folder, which must exist
     """
@@ -42,14 +42,14 @@ class FolderLock:
         """
         Acquire the lock, without waiting for it.
 
-        In a folder that cannot be written to, no lock is needed. On a file system without locks, a warning is given.
+        A folder that cannot be written to needs no lock. On a file system without locks, a warning is given.
 
         :raises FolderInUseError: if another training holds it, naming its host and process
         """
         try:
             self._acquire()
         except Timeout:
-            # A deleted model may wait for the garbage collector, as it is part of reference cycles
+            # A deleted model holds its lock until the garbage collector runs, as SB3's models are part of reference cycles
             gc.collect()
             try:
                 self._acquire()
@@ -68,7 +68,7 @@ class FolderLock:
         except (OSError, NotImplementedError) as error:
             if os.access(self.folder, os.W_OK):
                 warnings.warn(
-                    f"The folder {self.folder} cannot be locked ({error}): see to it that no other process uses it.",
+                    f"The folder {self.folder} cannot be locked ({error}): make sure that no other process uses it.",
                     stacklevel=2,
                 )
             return
@@ -82,7 +82,7 @@ class FolderLock:
             return "an unknown process"
 
     def release(self) -> None:
-        """Release the lock. Does nothing if it is not held by this process."""
+        """Release the lock. Do nothing if this process does not hold it."""
         if self.is_ours and self._lock.is_locked:
             with suppress(OSError):
                 (self.folder / OWNER_FILE).unlink()

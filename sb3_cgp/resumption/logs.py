@@ -9,7 +9,7 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 
 def read_start(path: Path) -> float:
     """
-    Return the time at which a monitor's file was started, which its times count from.
+    Return the start time of a monitor's file. The times of the episodes in the file are relative to it.
 
     :param path: the file
     :return: seconds since the epoch
@@ -20,8 +20,8 @@ def read_start(path: Path) -> float:
 
 def cut_monitors(path: Path, n_episodes: int | None, n_steps: int) -> None:
     """
-    Cut off the last episodes of a monitor's file, in place, so that a process that has it open to append continues after the
-    remaining ones.
+    Remove the last episodes from a monitor's file, in place. A process that has the file open for appending then continues
+    after the remaining episodes.
 
     :param path: the file
     :param n_episodes: the largest number of episodes to keep. None keeps those that ended within ``n_steps`` steps.
@@ -29,7 +29,7 @@ def cut_monitors(path: Path, n_episodes: int | None, n_steps: int) -> None:
     """
     with open(path, "rb") as file:
         _, columns, *rows = lines = file.readlines()
-    # A process that was killed, or a full disk, may have left a part of a row
+    # A killed process or a full disk may have left an incomplete row
     rows = [row for row in rows if row.endswith(b"\n")]
     if n_episodes is None:
         column, length, n_episodes = columns.strip().split(b",").index(b"l"), 0, 0
@@ -41,11 +41,11 @@ def cut_monitors(path: Path, n_episodes: int | None, n_steps: int) -> None:
 
 def continued_logger(folder: str, first_step: int, verbose: int) -> Logger:
     """
-    Make the logger that SB3 makes for TensorBoard, in a folder that already has events.
+    Create the logger that SB3 creates for TensorBoard, in a folder that already has events.
 
     :param folder: the folder
-    :param first_step: the step from which on TensorBoard hides the existing events, as they are about to be written again
-    :param verbose: the verbosity level; from 1 on, the log is printed, too
+    :param first_step: TensorBoard hides existing events from this step on, as the resumed training writes them again
+    :param verbose: the verbosity level; at 1 and above, the log is also printed
     :return: the logger
     """
     outputs: list[KVWriter] = [make_output_format("stdout", folder)] if verbose >= 1 else []
@@ -53,10 +53,10 @@ def continued_logger(folder: str, first_step: int, verbose: int) -> Logger:
 
 
 class _ContinuedTensorBoard(TensorBoardOutputFormat):
-    """SB3's writer for TensorBoard, with ``purge_step``, which SB3's constructor does not take."""
+    """SB3's writer for TensorBoard with the argument ``purge_step``, which SB3's constructor does not accept."""
 
     def __init__(self, folder: str, first_step: int):
-        # Late, as it imports TensorBoard
+        # A late import, as a plain installation has no TensorBoard
         from torch.utils.tensorboard import SummaryWriter
 
         self.writer = SummaryWriter(log_dir=folder, purge_step=first_step)

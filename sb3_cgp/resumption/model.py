@@ -1,4 +1,4 @@
-"""What a model remembers of the training that it is in, for the callback that saves the training's states."""
+"""The attributes of a model that describe its running training. The callback that saves training states uses them."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_cgp.resumption.locks import FolderLock
 
 State = dict[str, Any]
-# The attributes below, which describe a running training: neither SB3's zip nor a pickle holds them all
+# The attributes below, which describe a running training and are not part of SB3's zip
 UNSAVED = ("callback", "resumption", "saved_to", "_folder_locks", "_n_nested_trainings", "_warned_of")
 
 
@@ -38,7 +38,7 @@ class ResumableModel(OffPolicyAlgorithm):
         """
         Return the state that SB3's zip does not hold, as plain data. Subclasses add to what ``super()`` returns.
 
-        It is called before the zip and the pending log are taken, so that a model may bring both up to date here.
+        It is called before the zip and the pending log are copied, so that a model may update both in this method.
 
         :return: the state: None, numbers, strings, arrays, tensors, lists, tuples and dictionaries
         """
@@ -57,7 +57,7 @@ class ResumableModel(OffPolicyAlgorithm):
 
     def hold_folder(self, folder: Path) -> None:
         """
-        Lock a folder of training states for this model. Does nothing if the model holds it already.
+        Lock a folder of training states for this model. Do nothing if the model holds the lock already.
 
         :param folder: the folder, as an absolute path
         :raises FolderInUseError: if another training holds it
@@ -86,7 +86,7 @@ class ResumableModel(OffPolicyAlgorithm):
         # Python has a method of this name since 3.11
         inherited = getattr(super(), "__getstate__", None)
         state = vars(self) if inherited is None else inherited()
-        # A copy is no part of the running training: it has neither its callbacks nor its locks
+        # A copy does not take part in the running training, and has neither its callbacks nor its locks
         kept = {name: value for name, value in state.items() if name not in ("callback", "_folder_locks")}
         return kept | {"_n_nested_trainings": 0}
 

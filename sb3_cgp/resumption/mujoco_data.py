@@ -11,7 +11,7 @@ def get_mujoco_data(layer: Any) -> Any:
     Return a MuJoCo environment's data.
 
     :param layer: an environment or wrapper
-    :return: its ``data``, or None if it is no MuJoCo environment
+    :return: its ``data``, or None if it is not a MuJoCo environment
     """
     data = vars(layer).get("data")
     # By the name of its module, as importing MuJoCo takes long
@@ -47,7 +47,7 @@ def set_mujoco_state(data: Any, state: dict[str, Any]) -> None:
     Restore the state of a MuJoCo simulation.
 
     :param data: MuJoCo's data, of the same model
-    :param state: what :func:`mujoco_state` returned
+    :param state: the state that :func:`mujoco_state` returned
     """
     data.time = state["time"]
     for name, field in _fields(data):

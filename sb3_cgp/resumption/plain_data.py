@@ -1,4 +1,4 @@
-"""Objects' attributes as plain data, which a checkpoint can hold without pickle, and back."""
+"""Convert the attributes of objects to plain data, which a training state can hold without pickle, and back."""
 
 from collections import OrderedDict, deque
 from collections.abc import Collection, Mapping
@@ -10,10 +10,10 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 
 from sb3_cgp.common.rules import require
 
-# Marks a dictionary that stands for something else, and says for what
+# The key of a dictionary that represents another type; its value is the name of the type
 TYPE = "__type__"
 SCALARS = (type(None), bool, int, float, str, bytes)
-# The kinds of NumPy's types: booleans, and numbers
+# The kinds of NumPy's boolean and numeric data types
 NUMERIC = "biufc"
 COLLECTIONS: dict[str, Any] = {kind.__name__: kind for kind in (deque, set, frozenset)}
 MAPPINGS: dict[str, Any] = {kind.__name__: kind for kind in (dict, OrderedDict)}
@@ -28,16 +28,16 @@ BIT_GENERATORS: dict[str, Any] = {
 
 
 class NotPlainError(TypeError):
-    """A value is no plain data, nor anything that is known to be made of it."""
+    """A value cannot be represented as plain data."""
 
 
 def plain_attributes(obj: Any, without: Collection[str] = ()) -> dict[str, Any]:
     """
-    Copy those attributes of an object that are plain data, see :func:`to_plain`, and leave out the others.
+    Copy the attributes of an object that can be represented as plain data (see :func:`to_plain`). Omit all others.
 
     :param obj: the object
-    :param without: the names of attributes to leave out
-    :return: the attributes' values by name
+    :param without: the names of attributes to omit
+    :return: the plain data of each attribute, by name
     """
     state = {}
     for name, value in vars(obj).items():
@@ -45,21 +45,21 @@ def plain_attributes(obj: Any, without: Collection[str] = ()) -> dict[str, Any]:
             try:
                 state[name] = to_plain(value)
             except (NotPlainError, RecursionError):
-                # The latter is a list that holds itself
+                # A list that contains itself raises RecursionError
                 continue
     return state
 
 
 def set_plain_attributes(obj: Any, state: Mapping[str, Any]) -> None:
     """
-    Put back what :func:`plain_attributes` copied. What ``state`` does not name stays as it is.
+    Restore the attributes that :func:`plain_attributes` copied. Attributes that ``state`` does not name are not changed.
 
-    It goes to the object itself, past any ``__setattr__`` that hands values on, as wrappers have. Random generators and
-    running statistics are set in place where the object has them, so that whoever shares them still does.
+    The object's ``__setattr__`` is not called, as a wrapper's may set the attribute of the wrapped object instead. Random
+    generators and running statistics of the object are updated in place, so that other objects continue to share them.
 
-    :param obj: the object
-    :param state: the attributes' values by name
-    :raises ValueError: if a value stands for something unknown
+    :param obj: the object to change
+    :param state: the plain data of each attribute, by name
+    :raises ValueError: if the plain data represents an unknown type
     """
     attributes = vars(obj)
     for name, plain in state.items():
@@ -68,22 +68,23 @@ def set_plain_attributes(obj: Any, state: Mapping[str, Any]) -> None:
 
 def to_plain(value: Any) -> Any:
     """
-    Copy a value as plain data: ``None``, bool, int, float, str, bytes, NumPy's numeric arrays and scalars, and lists,
-    tuples and dictionaries (of strings as keys) of such.
+    Copy a value as plain data.
 
-    Other dictionaries, ordered ones, deques, sets, NumPy's random generators and running statistics (SB3's and
-    Gymnasium's) become dictionaries that say what they stand for. Neither the sharing of one object in several places nor
-    what a generator would ``spawn`` is kept. Subclasses of all these are refused, as they may hold more.
+    Plain data is ``None``, bool, int, float, str, bytes, numeric NumPy arrays and scalars, and lists, tuples and
+    dictionaries with string keys that contain only plain data. Dictionaries with other keys, OrderedDicts, deques, sets,
+    NumPy's random generators, and the running statistics of SB3 and Gymnasium are represented as dictionaries that name
+    the type. Subclasses of these types are refused, as they may hold further state. Two references to one object become
+    two copies. The state from which a generator would ``spawn`` others is not copied.
 
     :param value: the value
-    :return: the plain data, which shares nothing that could change with the value
-    :raises NotPlainError: if the value is anything else, or holds it
+    :return: the plain data, which shares no mutable object with the value
+    :raises NotPlainError: if the value, or a part of it, is of another type
     """
     kind = type(value)
     if kind in SCALARS or (isinstance(value, np.generic) and value.dtype.kind in NUMERIC):
         return value
     if kind is np.ndarray and value.dtype.kind in NUMERIC:
-        # The layout decides in which order sums are taken
+        # The memory layout determines the order in which NumPy adds numbers
         return value.copy(order="K")
     if kind in (list, tuple):
         return kind([to_plain(each) for each in value])
@@ -99,54 +100,54 @@ def to_plain(value: Any) -> Any:
     for name, statistics in STATISTICS.items():
         if kind is statistics:
             return {TYPE: name, "attributes": to_plain(vars(value))}
-    raise NotPlainError(f"A {kind.__module__}.{kind.__qualname__} is no plain data.")
+    raise NotPlainError(f"A {kind.__module__}.{kind.__qualname__} is not plain data.")
 
 
-def from_plain(plain: Any, there: Any = None) -> Any:
+def from_plain(plain: Any, current: Any = None) -> Any:
     """
-    Make the value that :func:`to_plain` copied.
+    Convert plain data back to the value that :func:`to_plain` copied.
 
     :param plain: the plain data
-    :param there: what the value is to take the place of, if anything; random generators and running statistics in it, or
-        within lists, tuples and dictionaries of it, are set in place and used again
-    :return: the value, which shares nothing that could change with the plain data
-    :raises ValueError: if the plain data stands for something unknown
+    :param current: the value that is about to be replaced, or None. Its random generators and running statistics, also
+        those within its lists, tuples and dictionaries, are updated in place and become part of the returned value.
+    :return: the value, which shares no mutable object with the plain data
+    :raises ValueError: if the plain data represents an unknown type
     """
     if type(plain) is np.ndarray:
         return plain.copy(order="K")
     if type(plain) in (list, tuple):
-        return type(plain)([from_plain(each, _part(there, index)) for index, each in enumerate(plain)])
+        return type(plain)([from_plain(each, _part(current, index)) for index, each in enumerate(plain)])
     if type(plain) is not dict:
         return plain
     name = plain.get(TYPE)
     if name is None:
-        return {key: from_plain(each, _part(there, key)) for key, each in plain.items()}
+        return {key: from_plain(each, _part(current, key)) for key, each in plain.items()}
     if name in MAPPINGS:
         pairs = [(from_plain(key), each) for key, each in plain["items"]]
-        return MAPPINGS[name]((key, from_plain(each, _part(there, key))) for key, each in pairs)
+        return MAPPINGS[name]((key, from_plain(each, _part(current, key))) for key, each in pairs)
     if name in COLLECTIONS:
         items = [from_plain(each) for each in plain["items"]]
         return deque(items, plain["maxlen"]) if name == deque.__name__ else COLLECTIONS[name](items)
     if name == np.random.Generator.__name__:
-        return _generator(from_plain(plain["state"]), there)
+        return _generator(from_plain(plain["state"]), current)
     require(name in STATISTICS, TYPE, name, f"one of {', '.join((*MAPPINGS, *COLLECTIONS, 'Generator', *STATISTICS))}")
-    statistics = there if type(there) is STATISTICS[name] else STATISTICS[name]()
+    statistics = current if type(current) is STATISTICS[name] else STATISTICS[name]()
     set_plain_attributes(statistics, plain["attributes"])
     return statistics
 
 
-def _part(there: Any, key: Any) -> Any:
-    """Find what a part of a value takes the place of."""
-    if isinstance(there, list | tuple):
-        return there[key] if key < len(there) else None
-    return there.get(key) if isinstance(there, dict) else None
+def _part(current: Any, key: Any) -> Any:
+    """Return the element of a list, tuple or dictionary at an index or key, or None if there is no such element."""
+    if isinstance(current, list | tuple):
+        return current[key] if key < len(current) else None
+    return current.get(key) if isinstance(current, dict) else None
 
 
-def _generator(state: dict[str, Any], there: Any) -> np.random.Generator:
-    """Set a random generator's state, in place if it is of the same kind."""
+def _generator(state: dict[str, Any], current: Any) -> np.random.Generator:
+    """Set the state of the current random generator, or of a new one if the current one is of another kind."""
     kind = state["bit_generator"]
     require(kind in BIT_GENERATORS, "bit_generator", kind, f"one of {', '.join(BIT_GENERATORS)}")
-    fits = type(there) is np.random.Generator and type(there.bit_generator) is BIT_GENERATORS[kind]
-    generator = there if fits else np.random.Generator(BIT_GENERATORS[kind]())
+    fits = type(current) is np.random.Generator and type(current.bit_generator) is BIT_GENERATORS[kind]
+    generator = current if fits else np.random.Generator(BIT_GENERATORS[kind]())
     generator.bit_generator.state = state
     return generator

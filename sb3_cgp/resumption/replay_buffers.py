@@ -76,7 +76,7 @@ def check_replay_buffer(buffer: ReplayBuffer) -> None:
     Refuse a replay buffer that cannot be saved.
 
     :param buffer: the buffer
-    :raises ValueError: if it holds the environment's infos, which may be anything, or an attribute that is no plain data
+    :raises ValueError: if the buffer holds the environment's infos, or an attribute that is not plain data
     """
     copies = isinstance(buffer, HerReplayBuffer) and buffer.copy_info_dict
     require(not copies, "copy_info_dict", copies, "False where the training is saved")
@@ -140,11 +140,11 @@ def _fit(buffer: ReplayBuffer, state: State) -> tuple[State, State]:
     return {path: values[:size] for path, values in rows.items()}, {"pos": n_rows % size, "full": n_rows == size}
 
 
-def _convert(path: str, values: np.ndarray, there: Any) -> np.ndarray:
-    """Convert rows to the type of a buffer's field; the shapes must be the same, and the values exact."""
+def _convert(path: str, values: np.ndarray, field: Any) -> np.ndarray:
+    """Convert rows to the data type of a buffer's field. Refuse another shape, and a conversion that is not exact."""
     name = f"replay_buffer.{path}"
-    dtype = np.asarray(there[:0].numpy(force=True)).dtype if isinstance(there, th.Tensor) else there.dtype
-    shape = tuple(there.shape[1:])
+    dtype = np.asarray(field[:0].numpy(force=True)).dtype if isinstance(field, th.Tensor) else field.dtype
+    shape = tuple(field.shape[1:])
     require(shape == values.shape[1:], name, f"of shape (buffer_size, {', '.join(map(str, shape))})", f"of {values.shape}")
     if dtype == values.dtype:
         return values

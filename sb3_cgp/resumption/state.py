@@ -1,5 +1,6 @@
 """
-The whole state of a training, from which it continues to the bit: SB3's zip, and all state that the zip leaves out.
+The complete state of a training: SB3's zip, and all state that the zip does not hold. A restored training is exact: it
+computes the same numbers as a training that was not interrupted.
 
 A state is a tree of plain data, arrays and tensors (:mod:`sb3_cgp.resumption.encoding`).
 """
@@ -29,14 +30,14 @@ STATISTICS = ("obs_rms", "ret_rms")
 
 def gather(model: ResumableModel, callback: BaseCallback) -> State:
     """
-    Gather the whole state of a training, between a gradient step and the next step of the environment.
+    Gather the complete state of a training, between the gradient steps of one rollout and the first step of the next.
 
     :param model: the model
     :param callback: the training's callbacks
-    :return: the state; its arrays may be those that the training goes on to change
+    :return: the state; it may share arrays with the training, which will change them
     """
     assert model.env is not None
-    # First, as a model may bring its other state up to date here
+    # First, as a model may update its attributes and its log in this call
     own = model.get_training_state()
     zipped = io.BytesIO()
     model.save(zipped)
@@ -83,14 +84,14 @@ def restore(model: ResumableModel, callback: BaseCallback, state: State) -> None
 
 def begin_new_episode(model: ResumableModel, state: State) -> None:
     """
-    Prepare a training whose environment cannot be restored to continue at the start of an episode.
+    Prepare a training whose environment cannot be restored to continue at the start of a new episode.
 
     :param model: the model, whose environment is about to be reset
     :param state: the state
     """
     warnings.warn(
-        f"The environment's state was not saved: {state['not_restorable']} The training goes on at an episode's start, and no "
-        "longer equals one that was never interrupted.",
+        f"The environment's state was not saved: {state['not_restorable']} The training continues at the start of a "
+        "new episode, and its results will differ from those of an uninterrupted training.",
         stacklevel=2,
     )
     model._last_obs = None
@@ -102,7 +103,7 @@ def begin_new_episode(model: ResumableModel, state: State) -> None:
 
 def warn_of_unsaved(model: ResumableModel, callback: BaseCallback) -> None:
     """
-    Warn of environments whose state cannot be saved, once in a training for each.
+    Warn once per training of each environment whose state cannot be saved.
 
     :param model: the model
     :param callback: the training's callbacks
@@ -111,7 +112,7 @@ def warn_of_unsaved(model: ResumableModel, callback: BaseCallback) -> None:
     problems = obstacles(model.env)
     found = warn_of_unrestorable(callback, model.env)
     if problems:
-        consequence = "A resumed training will go on at the start of an episode, and will not equal an uninterrupted one."
+        consequence = "A resumed training will continue at the start of a new episode, unlike an uninterrupted one."
         found.insert(0, f"The environment's state cannot be saved. {' '.join(problems)} {consequence}")
     for message in found:
         if message not in model._warned_of:
@@ -134,7 +135,7 @@ def check_fits(model: ResumableModel, state: State) -> None:
 
 
 def _pending(logger: Logger) -> State:
-    """Copy the recorded values that are not written yet, except for images and the like."""
+    """Copy the recorded numbers and strings that have not been written. Images, figures and videos are omitted."""
     plain = {key: value for key, value in logger.name_to_value.items() if isinstance(value, (int, float, str, np.generic))}
     return {
         "name_to_value": plain,

@@ -1,5 +1,5 @@
 """
-A folder of training states, each of which is written as a whole or not at all, and verified when it is read.
+A folder of training states. A state is written completely or not at all, and is verified when it is read.
 
 ``state-<step>.json`` holds a state's plain data. Arrays lie in a folder of blocks, which are files named by the SHA-256 of
 their content, so that states share equal blocks: of a replay buffer, only the changed blocks are written. There are two such
@@ -50,21 +50,21 @@ class StateStore:
     A state is a tree of dictionaries (keys: strings, integers), lists, tuples, None, booleans, numbers, strings, bytes, NumPy
     arrays and scalars, and PyTorch tensors, which come back on the CPU.
 
-    :param folder: the folder, which is made when the first state is saved
+    :param folder: the folder, which is created when the first state is saved
     :param keep: how many states to keep, at least 1. If it is 1, only one of the folders of blocks is used.
     """
 
     def __init__(self, folder: str | Path, keep: int = 2):
         self.folder = Path(folder)
         self.keep = keep
-        # The blocks that this process has written, or read and verified
+        # The blocks that this process has written or verified
         self._good_blocks: set[Path] = set()
 
     def prepare(self) -> None:
         """
-        Make the folder, and check that states can be written to it.
+        Make the folder, and check that files can be written to it.
 
-        :raises OSError: if they cannot, naming the file
+        :raises OSError: if they cannot be written, naming the file
         """
         attempt = self.folder / f"{PARTIAL}attempt"
         write_atomically(attempt, b"")
@@ -81,7 +81,7 @@ class StateStore:
 
     def digests(self) -> frozenset[str]:
         """
-        Return the digests of the states, by which a training recognises its own.
+        Return the digests of the states, by which a training recognises its own states.
 
         :return: the step and the checksum of each state, unverified
         """
@@ -93,14 +93,14 @@ class StateStore:
 
     def save(self, step: int, state: Mapping[str, Any]) -> None:
         """
-        Save a state, and remove the oldest ones beyond those to keep.
+        Save a state, and remove the oldest states beyond the number to keep.
 
-        States of later steps are removed: they were damaged when the training was resumed.
+        States of later steps are removed, too, as they were damaged when the training was resumed.
 
         :param step: the state's step
         :param state: the state
-        :raises TypeError: if something in it is not plain data, naming where it is
-        :raises OSError: if it cannot be written, naming the file; older states are still there
+        :raises TypeError: if a part of the state is not plain data, naming its place in the state
+        :raises OSError: if the state cannot be written, naming the file; older states are kept
         """
         blocks = self._next_block_folder(step)
         encoder = Encoder(partial(self._write_block, blocks))
@@ -114,11 +114,11 @@ class StateStore:
 
     def load(self) -> tuple[int, dict[str, Any]]:
         """
-        Load the newest state of which nothing is damaged. Others are named in a warning.
+        Load the newest undamaged state. A warning names the damaged files of newer states.
 
-        :return: its step, and the state
-        :raises FileNotFoundError: if there is no state
-        :raises NoStateLeftError: if all are damaged, naming their files
+        :return: the state's step, and the state
+        :raises FileNotFoundError: if the folder holds no state
+        :raises NoStateLeftError: if all states are damaged, naming their files
         """
         damaged: list[str] = []
         for step in reversed(self.steps()):
@@ -139,7 +139,7 @@ class StateStore:
         return self.folder / f"state-{step:012d}.json"
 
     def _next_block_folder(self, step: int) -> str:
-        """Return the folder of a state's blocks: not that of the state before it, so that one of them survives damage."""
+        """Return the folder for a state's blocks. The previous state uses the other one: damage affects only one."""
         for each in reversed([each for each in self.steps() if each < step]):
             try:
                 last = BLOCK_FOLDERS.index(self._read_manifest(each)["blocks"])
@@ -172,7 +172,7 @@ class StateStore:
         path = self._block(blocks, digest)
         try:
             if path in self._good_blocks:
-                # The size suffices, as the content was verified before, and may be gigabytes
+                # The content, which may be gigabytes, was verified before
                 return path.stat().st_size == size
             self._read_block(blocks, digest)
         except (DamagedStateError, FileNotFoundError):
@@ -182,7 +182,7 @@ class StateStore:
     def _read_block(self, blocks: str, digest: str) -> bytes:
         path = self._block(blocks, digest)
         if not DIGEST.fullmatch(digest):
-            raise DamagedStateError(path, "it is not called by a checksum")
+            raise DamagedStateError(path, "its name is not a checksum")
         try:
             content = path.read_bytes()
         except OSError as error:
@@ -200,7 +200,7 @@ class StateStore:
         return digest
 
     def _prune(self, step: int) -> None:
-        """Remove the files that no state needs. The next call removes those that a failure leaves."""
+        """Remove the files that no kept state needs. Files that a failure leaves behind are removed by the next call."""
         steps = self.steps()
         kept = [each for each in steps if each <= step][-self.keep :]
         for each in set(steps) - set(kept):
@@ -210,7 +210,7 @@ class StateStore:
             try:
                 body = self._read_manifest(each)
             except DamagedStateError:
-                # The blocks that it needs are not known
+                # The blocks of a damaged state are not known
                 return
             needed.update(self._block(body["blocks"], digest) for digest in iter_digests(body["state"]))
         folders = [self.folder / name for name in BLOCK_FOLDERS]
