@@ -228,6 +228,7 @@ class CGP(
         require(self.resumption is None, "resumption", "a loaded state", allowed)
         with self.as_training(), self._explaining_errors():
             self._check_normalisation()
+            self._fit_replay_buffer()
             return super().train_policy(max_steps, batch_size, callback, progress_bar)
 
     @classmethod

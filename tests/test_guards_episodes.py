@@ -8,10 +8,12 @@ import pickle
 import numpy as np
 import pytest
 from guarded import SMALL, GuardedTD3, Located, assert_no_episode_runs_into_another, located
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import TD3
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from trainings import Do
 
@@ -383,3 +385,97 @@ def test_a_final_observation_that_reset_overwrites_is_copied():
     assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)
     ends = model.replay_buffer.dones[:30] == 1
     np.testing.assert_array_equal(model.replay_buffer.next_observations[:30][ends][:, 1], 7)
+
+
+@pytest.mark.parametrize("within", ["Monitor", "TimeLimit"])
+@pytest.mark.parametrize("when", ["between", "in a callback"])
+def test_an_environment_that_is_shared_with_an_evaluation_is_noticed(within, when):
+    env = Monitor(Located(50)) if within == "Monitor" else TimeLimit(Located(50), 20)
+    model = make_model("n-step", env=env)
+    # In a vectorised environment of its own
+    evaluation = DummyVecEnv([lambda: env])
+    if when == "between":
+        model.learn(15)
+        evaluate_policy(model, evaluation, n_eval_episodes=1, warn=False)
+        model.learn(15, reset_num_timesteps=False)
+    else:
+        with pytest.warns(UserWarning, match="The training environment was reset or stepped outside of this training"):
+            model.learn(30, callback=Do(15, lambda: evaluate_policy(model, evaluation, n_eval_episodes=1, warn=False)))
+    assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)
+
+
+class Foreign(VecEnv):
+    """A vectorised environment of another package, which keeps neither actions nor infos, as simulators on a GPU."""
+
+    def __init__(self, infos):
+        self.inner, self.infos = Located(), infos
+        super().__init__(1, self.inner.observation_space, self.inner.action_space)
+
+    @property
+    def reset_infos(self):
+        return None if self.infos is None else [{}]
+
+    @reset_infos.setter
+    def reset_infos(self, infos):
+        pass
+
+    def reset(self):
+        return self.inner.reset()[0][None]
+
+    def step_async(self, actions):
+        self.given = actions
+
+    def step_wait(self):
+        observation, reward, terminated, truncated, info = self.inner.step(self.given[0])
+        if terminated or truncated:
+            info = {"terminal_observation": observation, "TimeLimit.truncated": truncated}
+            observation = self.inner.reset()[0]
+        return observation[None], np.array([reward]), np.array([terminated or truncated]), [info]
+
+    def close(self):
+        pass
+
+    def get_attr(self, attr_name, indices=None):
+        return [getattr(self.inner, attr_name)]
+
+    def set_attr(self, attr_name, value, indices=None):
+        raise NotImplementedError
+
+    def env_method(self, method_name, *args, indices=None, **kwargs):
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class, indices=None):
+        return [False]
+
+
+class ToSimulator(VecEnvWrapper):
+    """Says that what it wraps is a simulator, as a robot's package does."""
+
+    @property
+    def unwrapped(self):
+        return object()
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+
+@pytest.mark.parametrize("infos", [None, "new ones"])
+@pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor, VecNormalize, ToSimulator])
+def test_environments_of_other_packages_are_trained_on_as_by_sb3(infos, wrap):
+    guarded, plain = (algorithm("MlpPolicy", wrap(Foreign(infos)), **SMALL).learn(30) for algorithm in (GuardedTD3, TD3))
+    assert guarded._n_updates == plain._n_updates == 24
+    np.testing.assert_array_equal(guarded.replay_buffer.dones, plain.replay_buffer.dones)
+    assert_no_episode_runs_into_another(guarded.replay_buffer) if wrap is not VecNormalize else None
+
+
+def test_an_environment_that_a_callback_sets_within_a_step_is_refused():
+    model = make_model("plain")
+    with pytest.raises(RuntimeError, match="`set_env` was called by a callback in the middle of a step"):
+        model.learn(30, callback=Do(15, lambda: model.set_env(located())))
+    model.set_env(located())
+    model.learn(20, reset_num_timesteps=False)
+    assert np.isfinite(model.replay_buffer.observations).all()
+    assert_no_episode_runs_into_another(model.replay_buffer)

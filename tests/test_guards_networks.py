@@ -3,10 +3,11 @@
 import random
 import re
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from guarded import SMALL, GuardedTD3, Located, located
+from guarded import ACTIONS, SMALL, GuardedTD3, Located, located
 from gymnasium import spaces
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -14,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from torch import nn
 
+from sb3_cgp import CGP, Selection
 from sb3_cgp.guards import GuardedAlgorithm
 from sb3_cgp.guards.networks import NetworkGuard
 
@@ -176,7 +178,7 @@ def test_a_selector_of_a_wrong_shape_is_refused():
             selection = type("Selection", (), {"actions": th.zeros(3, 5)})
             self.policy.select_actions = lambda observations, critic: selection
 
-    with pytest.raises(ValueError, match=r"The selector cannot .* output has shape \(3, 5\), where \(3, 1\) is expected"):
+    with pytest.raises(ValueError, match=r"The selector of actions .* output has shape \(3, 5\), where \(3, 1\) is expected"):
         make_model(algorithm=type("Guarded", (GuardedAlgorithm, Selecting), {}))
 
 
@@ -186,3 +188,60 @@ def test_a_policy_that_cannot_be_copied_is_not_tried():
             raise TypeError("this one is unique")
 
     make_model(Uncopyable).learn(20)
+
+
+@pytest.mark.parametrize(
+    ("actions", "elites", "message"),
+    [
+        (lambda n, d: th.zeros(n, d, dtype=th.float64), None, "its `actions` are torch.float64"),
+        (lambda n, d: np.zeros((n, d), np.float32), None, "its `actions` are a ndarray"),
+        (lambda n, d: th.full((n, d), th.nan), None, r"its `actions` are not within \[-1, 1\]"),
+        (lambda n, d: th.full((n, d), 1.5), None, r"its `actions` are not within \[-1, 1\]"),
+        (lambda n, d: th.zeros(n, d), lambda n, d: None, "its `elites` are a NoneType"),
+        (lambda n, d: th.zeros(n, d), lambda n, d: th.zeros(n, d), r"its `elites` have shape \(3, 1\)"),
+    ],
+)
+def test_a_selector_whose_selection_is_of_no_use_is_refused(actions, elites, message):
+    class Own:
+        def select(self, score, n_states, action_dim, device="cpu"):
+            chosen = actions(n_states, action_dim)
+            return Selection(chosen, th.zeros(n_states, 2, action_dim) if elites is None else elites(n_states, action_dim))
+
+    with pytest.raises(ValueError, match=f"The selector of actions failed .*{message}.*`policy_kwargs\\['selector'\\]`"):
+        CGP("MlpPolicy", "Pendulum-v1", buffer_size=10, policy_kwargs=dict(net_arch=[8], selector=Own()))
+
+
+def test_networks_for_a_part_of_the_space_are_taken():
+    class Embedded(BaseFeaturesExtractor):
+        """Knows the first ten whole numbers only."""
+
+        def __init__(self, space):
+            super().__init__(space, 3)
+            self.embedding = th.nn.Embedding(10, 3)
+
+        def forward(self, observations):
+            return self.embedding(observations[:, 0].long())
+
+    class Counting(gym.Env):
+        observation_space = spaces.Box(-100, 100, (1,), np.float32)
+        action_space = ACTIONS
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            return np.full(1, 9, np.float32), 0.0, True, False, {}
+
+    kwargs = dict(net_arch=[4], features_extractor_class=Embedded)
+    assert GuardedTD3("MlpPolicy", Counting(), **(SMALL | dict(policy_kwargs=kwargs))).learn(20)._n_updates == 14
+
+
+@pytest.mark.parametrize(
+    "compute_reward",
+    [lambda self, achieved, desired, info: 1.0, lambda self, achieved, desired: np.ones(len(achieved))],
+    ids=["one number", "two parameters"],
+)
+def test_rewards_of_goals_that_are_not_those_of_a_batch_are_refused(compute_reward):
+    env = type("Goals", (Located,), dict(compute_reward=compute_reward))(goals=True)
+    with pytest.raises(ValueError, match=r"`env.compute_reward` is .* must be able to return the rewards of a batch"):
+        GuardedTD3("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, **SMALL)

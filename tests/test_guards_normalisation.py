@@ -1,5 +1,7 @@
 """``VecNormalize`` that is forgotten, new, or in the wrong place."""
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -55,12 +57,27 @@ def test_saved_statistics_are_the_remedy(tmp_path):
 
 def test_new_statistics_are_warned_of_and_leave_observations_as_they_are_where_that_is_asked_for(tmp_path):
     path = saved(make_model(VecNormalize(located())).learn(20), tmp_path)
-    for env in (VecNormalize(located()), VecNormalize(located(), training=False, clip_obs=float("inf"))):
+    for env in (VecNormalize(located()), VecNormalize(located(), training=False)):
         with pytest.warns(UserWarning, match=NEW) as warned:
-            loaded = GuardedTD3.load(path, env).learn(20)
+            GuardedTD3.load(path, env).learn(20)
         assert len(warned) == 1
+    # As the error for raw observations advises
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loaded = GuardedTD3.load(path, VecNormalize(located(), training=False, clip_obs=float("inf"))).learn(20)
     observations = np.array([[300.0, 4.0]], np.float32)
     np.testing.assert_allclose(loaded.get_vec_normalize_env().normalize_obs(observations), observations, rtol=1e-6)
+
+
+@pytest.mark.filterwarnings("error")
+def test_saved_statistics_that_do_not_grow_are_not_taken_for_new_ones(tmp_path):
+    normalizer = VecNormalize(located())
+    path = saved(make_model(normalizer).learn(20), tmp_path)
+    normalizer.save(tmp_path / "statistics")
+    env = VecNormalize.load(tmp_path / "statistics", located())
+    env.training = False
+    # Longer than the training that made the statistics
+    GuardedTD3.load(path, env).learn(60)
 
 
 @pytest.mark.filterwarnings("error")

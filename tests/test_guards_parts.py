@@ -1,5 +1,7 @@
 """Parts that do not fit together, and action spaces that cannot be scaled: adapted, or refused by name."""
 
+import copy
+
 import numpy as np
 import pytest
 from guarded import SMALL, GuardedTD3, Located, located
@@ -176,3 +178,23 @@ def test_an_action_space_that_can_be_scaled_is_taken(bound, dtype):
     policy = GuardedTD3("MlpPolicy", DummyVecEnv([lambda: env]), **SMALL).policy
     for action in (space.low, space.high, (space.high / 2).astype(dtype)):
         np.testing.assert_allclose(policy.unscale_action(policy.scale_action(action)), action, rtol=1e-6)
+
+
+class Paying(Located):
+    """Pays more than another."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return np.full(len(achieved_goal), 5.0, np.float32)
+
+
+def test_hindsight_asks_the_environment_that_was_set_last():
+    model = GuardedTD3(
+        "MultiInputPolicy", located(goals=True), replay_buffer_class=HerReplayBuffer, **SMALL | dict(learning_starts=16)
+    ).learn(20)
+    model.set_env(DummyVecEnv([lambda: Paying(goals=True)]))
+    model.learn(10, reset_num_timesteps=False)
+    assert 5.0 in model.replay_buffer.sample(64).rewards
+    # A copied buffer has no environment until it learns
+    copied = copy.deepcopy(model)
+    copied.learn(10, reset_num_timesteps=False)
+    assert copied.replay_buffer.env is copied.env

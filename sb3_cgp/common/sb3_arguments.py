@@ -33,7 +33,7 @@ def check_learning_rate(name: str, value: Any) -> None:
 
     :param name: the argument's name
     :param value: the argument's value
-    :raises ValueError: if the value is not a number >= 0, a schedule or a string such as ``"lin_1e-3"``
+    :raises ValueError: if the value is not a number >= 0, a schedule of such numbers or a string such as ``"lin_1e-3"``
     """
     if isinstance(value, str):
         prefix, _, initial_value = value.partition("_")
@@ -42,7 +42,10 @@ def check_learning_rate(name: str, value: Any) -> None:
         except ValueError:
             is_valid = False
         require(is_valid, name, value, f"a number >= 0, a schedule, or a string such as '{LINEAR_SCHEDULE_PREFIX}1e-3'")
-    elif not callable(value):
+    elif callable(value):
+        for progress_remaining in (1.0, 0.5):
+            require_number(f"{name}({progress_remaining})", value(progress_remaining))
+    else:
         require_number(name, value)
 
 

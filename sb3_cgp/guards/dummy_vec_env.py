@@ -11,6 +11,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_cgp.guards.explanations import OLD_RESET
+from sb3_cgp.guards.observations import innermost
 from sb3_cgp.guards.transitions import check_shape
 
 SelfDummyVecEnvGuard = TypeVar("SelfDummyVecEnvGuard", bound="DummyVecEnvGuard")
@@ -33,7 +34,7 @@ class DummyVecEnvGuard(OffPolicyAlgorithm):
         :return: the trained model
         :raises ValueError: if an observation is of a wrong shape, or ``reset`` has the old API
         """
-        env = None if self.env is None else self.env.unwrapped
+        env = innermost(self.env)
         if not isinstance(env, DummyVecEnv):
             return super().learn(*args, **kwargs)
         with ExitStack() as stack:

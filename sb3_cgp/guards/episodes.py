@@ -1,6 +1,5 @@
 """Episodes that end unseen: an environment that was reset or stepped elsewhere, or a step that was not stored."""
 
-import operator
 import warnings
 from typing import Any
 
@@ -17,8 +16,10 @@ from sb3_cgp.guards.observations import (
     continues_last_episode,
     copy_observations,
     count_observations,
+    innermost,
     position_of,
     same_observations,
+    same_position,
 )
 
 
@@ -36,6 +37,7 @@ class EpisodeGuard(OffPolicyAlgorithm):
     # The step of the training's own that is not stored yet
     _own_step: "_OwnStep | None" = None
     _has_warned_of_moves: bool = False
+    _is_in_rollout: bool = False
 
     def _setup_learn(
         self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any, **kwargs: Any
@@ -59,11 +61,17 @@ class EpisodeGuard(OffPolicyAlgorithm):
         :param env: The environment for learning a policy
         :param force_reset: Force call to ``reset()`` before training. With False, the environment must be in the state that
             the model's last observation is of. A ``DummyVecEnv`` that is not is reset when ``learn`` starts.
+        :raises RuntimeError: if a callback calls it in the middle of a step
         """
-        previous = None if self.env is None else self.env.unwrapped
+        if self._own_step is not None and self._own_step.position is not None and self._is_in_rollout:
+            raise RuntimeError(
+                "`set_env` was called by a callback in the middle of a step, whose transition would be lost: call it in "
+                "`_on_rollout_end`, when the step is over, or between two calls of `learn`."
+            )
+        previous = innermost(self.env)
         super().set_env(env, force_reset)
         assert self.env is not None
-        if self.env.unwrapped is not previous:
+        if innermost(self.env) is not previous:
             self._left_env_at = None
 
     def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any) -> RolloutReturn:
@@ -76,7 +84,11 @@ class EpisodeGuard(OffPolicyAlgorithm):
         :param kwargs: the further arguments of SB3's method
         :return: the numbers of steps and episodes, and whether to go on
         """
-        return super().collect_rollouts(env, _StepObserver(callback, self), *args, **kwargs)  # type: ignore[arg-type]
+        self._is_in_rollout = True
+        try:
+            return super().collect_rollouts(env, _StepObserver(callback, self), *args, **kwargs)  # type: ignore[arg-type]
+        finally:
+            self._is_in_rollout = False
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -161,7 +173,7 @@ class EpisodeGuard(OffPolicyAlgorithm):
             # Nothing is known, or the last observation was set on purpose, as in resuming a training
             return False
         position = position_of(self.env)
-        return len(position) != len(mark.position) or not all(map(operator.is_, position, mark.position))
+        return not same_position(position, mark.position)
 
     def _env_differs(self) -> bool:
         """Return whether the environment shows other observations than the model's last ones, as far as it shows any."""
@@ -177,7 +189,7 @@ class EpisodeGuard(OffPolicyAlgorithm):
         return shown is not None and not same_observations(shown, last)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_left_env_at", "_own_step", "_has_warned_of_moves"]
+        return [*super()._excluded_save_params(), "_left_env_at", "_own_step", "_has_warned_of_moves", "_is_in_rollout"]
 
 
 class _EnvMark:

@@ -59,6 +59,33 @@ def check_goals(model: OffPolicyAlgorithm) -> None:
     if model.env is not None:
         allowed = "one with a method `compute_reward(achieved_goal, desired_goal, info)` for a HerReplayBuffer"
         require(model.env.has_attr("compute_reward"), "env", model.env, allowed)
+        _try_rewards(model)
+
+
+def _try_rewards(model: OffPolicyAlgorithm) -> None:
+    """Compute the rewards of two goals, as hindsight replay computes those of a batch."""
+    assert model.env is not None
+    assert isinstance(model.observation_space, spaces.Dict)
+    achieved, desired = (
+        np.zeros((2, *(model.observation_space[key].shape or ())), model.observation_space[key].dtype) for key in GOAL_KEYS[1:]
+    )
+    try:
+        rewards = model.env.env_method("compute_reward", achieved, desired, [{}, {}], indices=[0])[0]
+        is_batch = np.shape(rewards) in ((2,), (2, 1))
+    except TypeError as error:
+        if "argument" not in str(error):
+            return
+        rewards, is_batch = f"{type(error).__name__}: {error}", False
+    except Exception:
+        # It may need more than a new environment has, or entries of `info`
+        return
+    require(
+        is_batch,
+        "env.compute_reward",
+        rewards,
+        "able to return the rewards of a batch: `compute_reward(achieved_goal, desired_goal, info)` is given arrays of B "
+        "goals and a list of B infos, and returns an array of shape (B,)",
+    )
 
 
 def try_networks(model: OffPolicyAlgorithm) -> None:
@@ -79,17 +106,29 @@ def try_networks(model: OffPolicyAlgorithm) -> None:
         # A copy is made for this trial alone: it is no rule that a policy can be copied
         return
     with preserved_random_state(model.device):
-        batch_size = min(model.batch_size, 3)
-        observations = _random_observations(model.observation_space, batch_size, model.device)
-        actions = th.zeros(batch_size, get_action_dim(model.action_space), device=model.device)
-        with _naming(model, "actor"):
-            _try_training(policy.actor, lambda: [policy.actor(observations)], actions.shape)
-        with _naming(model, "critic"):
-            _try_training(policy.critic, lambda: policy.critic(observations, actions), (batch_size, 1))
-        if hasattr(policy, "select_actions"):
-            for critic in (policy.critic, policy.critic_target):
-                with _naming(model, "selector"), th.no_grad():
-                    _require_shape(policy.select_actions(observations, critic).actions, actions.shape)
+        try:
+            _try_on(policy, model, is_random=True)
+        except ValueError as error:
+            # The environment may use a part of its space only, for which the networks are made
+            try:
+                _try_on(policy, model, is_random=False)
+            except ValueError:
+                raise error from error.__cause__
+
+
+def _try_on(policy: Any, model: OffPolicyAlgorithm, is_random: bool) -> None:
+    """Try a copied policy on a batch of random observations, or of zeros where the space has them."""
+    batch_size = min(model.batch_size, 3)
+    observations = _make_observations(model.observation_space, batch_size, model.device, is_random)
+    actions = th.zeros(batch_size, get_action_dim(model.action_space), device=model.device)
+    with _naming(model, "actor"):
+        _try_training(policy.actor, lambda: [policy.actor(observations)], actions.shape)
+    with _naming(model, "critic"):
+        _try_training(policy.critic, lambda: policy.critic(observations, actions), (batch_size, 1))
+    if hasattr(policy, "select_actions"):
+        for critic in (policy.critic, policy.critic_target):
+            with _naming_selector(), th.no_grad():
+                _require_selection(policy.select_actions(observations, critic), actions)
 
 
 def _try_training(network: th.nn.Module, call: Callable[[], Any], shape: tuple[int, ...]) -> None:
@@ -109,6 +148,35 @@ def _require_shape(output: th.Tensor, shape: tuple[int, ...]) -> None:
         raise ValueError(f"its output has shape {tuple(output.shape)}, where {tuple(shape)} is expected")
 
 
+def _require_selection(selection: Any, actions: th.Tensor) -> None:
+    """Check a selection against actions of the right shape, type and device."""
+    for name in ("actions", "elites"):
+        values = getattr(selection, name)
+        if not isinstance(values, th.Tensor) or values.dtype != actions.dtype or values.device != actions.device:
+            kind = f"{values.dtype} on {values.device}" if isinstance(values, th.Tensor) else f"a {type(values).__name__}"
+            raise ValueError(f"its `{name}` are {kind}, where a tensor of {actions.dtype} on {actions.device} is expected")
+        if name == "actions":
+            _require_shape(values, tuple(actions.shape))
+    selected, elites = selection.actions, selection.elites
+    if elites.dim() != 3 or (elites.shape[0], elites.shape[2]) != tuple(actions.shape):
+        raise ValueError(f"its `elites` have shape {tuple(elites.shape)}, where (B, K, A) is expected")
+    if not bool((selected.abs() <= 1.0).all()):
+        raise ValueError(f"its `actions` are not within [-1, 1]: {selected.tolist()}")
+
+
+@contextmanager
+def _naming_selector() -> Iterator[None]:
+    """Name the selector in an error."""
+    try:
+        yield
+    except Exception as error:
+        raise ValueError(
+            f"The selector of actions failed for a batch of observations: {type(error).__name__}: {error}. Change "
+            "`policy_kwargs['selector']`, an instance with a method `select` that returns a `Selection`, or the policy's "
+            "`make_score`."
+        ) from error
+
+
 @contextmanager
 def _naming(model: OffPolicyAlgorithm, network: str) -> Iterator[None]:
     """Name the network and the observation space in an error."""
@@ -123,12 +191,21 @@ def _naming(model: OffPolicyAlgorithm, network: str) -> Iterator[None]:
         ) from error
 
 
-def _random_observations(space: spaces.Space, batch_size: int, device: th.device) -> Any:
-    """Return random observations of the shapes that a replay buffer samples, (B, *shape), by key for ``Dict`` spaces."""
+def _near_zero(space: spaces.Space) -> Any:
+    """Return an observation of zeros, as far as its bounds allow; a random one of spaces that are no ``Box``."""
+    if isinstance(space, spaces.Dict):
+        return {key: _near_zero(subspace) for key, subspace in space.items()}
+    if isinstance(space, spaces.Box):
+        return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
+    return space.sample()
+
+
+def _make_observations(space: spaces.Space, batch_size: int, device: th.device, is_random: bool) -> Any:
+    """Return observations of the shapes that a replay buffer samples, (B, *shape), by key for ``Dict`` spaces."""
     # A copy, as the space has random numbers of its own
     space = copy.deepcopy(space)
     space.seed(0)
-    samples = [space.sample() for _ in range(batch_size)]
+    samples = [space.sample() if is_random else _near_zero(space) for _ in range(batch_size)]
     shape = get_obs_shape(space)
 
     def stack(values: list[Any], each_shape: tuple[int, ...]) -> th.Tensor:

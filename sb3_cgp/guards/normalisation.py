@@ -85,8 +85,13 @@ class NormalisationGuard(OffPolicyAlgorithm):
             return
         statistics = normalizer.obs_rms
         count = min(each.count for each in statistics.values()) if isinstance(statistics, dict) else statistics.count
-        # The steps of this training, its reset, and SB3's initial count
-        if count <= self.num_timesteps - self._num_timesteps_at_start + self.n_envs + 1e-3:
+        if normalizer.training:
+            # The steps of this training, its reset, and SB3's initial count
+            is_new = count <= self.num_timesteps - self._num_timesteps_at_start + self.n_envs + 1e-3
+        else:
+            # Saved statistics have counted. New ones without a bound are the identity, which the error above advises.
+            is_new = count < 1 and bool(np.isfinite(normalizer.clip_obs))
+        if is_new:
             warnings.warn(
                 "The model has learnt from normalised observations, and the `VecNormalize` of `env` has new statistics: the "
                 "networks see other observations than before. Use `model.set_env(VecNormalize.load(path, env))`, with the "

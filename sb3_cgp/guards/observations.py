@@ -2,25 +2,72 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
+
+
+def innermost(env: VecEnv | None) -> Any:
+    """
+    Return the vectorised environment within SB3's wrappers.
+
+    ``VecEnv.unwrapped`` would be what a wrapper of another package says, which may be its simulator.
+
+    :param env: the environment, if there is one
+    :return: the innermost ``VecEnv``
+    """
+    while isinstance(env, VecEnvWrapper) and isinstance(vars(env).get("venv"), VecEnv):
+        env = env.venv
+    return env
 
 
 def position_of(env: VecEnv) -> tuple[Any, ...]:
     """
-    List objects that SB3's environments replace when they are stepped or reset.
+    List what tells whether an environment was stepped or reset: objects, which SB3's environments replace, and counters.
 
     A ``DummyVecEnv`` keeps the last actions, and the ``info`` of each environment's last reset. A ``SubprocVecEnv`` keeps the
-    latter in a new tuple. An environment of another class may keep neither, and is then not noticed to have moved.
+    latter in a new tuple. The environments within a ``DummyVecEnv``, which others may step too, count their steps in SB3's
+    ``Monitor`` and in Gymnasium's ``TimeLimit``. Vectorised environments of other packages are not known to do so.
 
     :param env: the environment
-    :return: the objects, to be compared by identity
+    :return: the objects and counters, to be compared by :func:`same_position`; none for other packages' environments
     """
-    bare = env.unwrapped
+    bare = innermost(env)
+    if not isinstance(bare, DummyVecEnv | SubprocVecEnv):
+        return ()
     infos = bare.reset_infos
-    return (getattr(bare, "actions", None), *(infos if isinstance(infos, list) else [infos]))
+    position = [getattr(bare, "actions", None), *(infos if isinstance(infos, list) else [infos])]
+    if isinstance(bare, DummyVecEnv):
+        for each in bare.envs:
+            position += _counters(each)
+    return tuple(position)
+
+
+def _counters(env: gym.Env) -> list[int]:
+    """List the counters of an environment and its wrappers that change when they are stepped or reset."""
+    counters = []
+    while True:
+        attributes = vars(env)
+        counters += [attributes[name] for name in ("_elapsed_steps", "total_steps") if type(attributes.get(name)) is int]
+        if not isinstance(env, gym.Wrapper):
+            break
+        env = env.env
+    return counters
+
+
+def same_position(first: tuple[Any, ...], second: tuple[Any, ...]) -> bool:
+    """
+    Return whether two positions are the same: counters are compared by value, objects by identity.
+
+    :param first: what :func:`position_of` returned
+    :param second: what it returned another time
+    :return: whether the environment has not moved in between
+    """
+    return len(first) == len(second) and all(
+        each == other if type(each) is int else each is other for each, other in zip(first, second, strict=True)
+    )
 
 
 def continues_last_episode(buffer: ReplayBuffer, observations: Any) -> bool:

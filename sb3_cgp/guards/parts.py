@@ -54,6 +54,7 @@ class PartsGuard(OffPolicyAlgorithm):
                 f"The value of `replay_buffer` is None: a model with {self.replay_buffer_class} that was loaded without an "
                 f"environment can act, and not learn. Load it with one: `{type(self).__name__}.load(path, env)`."
             )
+        self._fit_replay_buffer()
         return result
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
@@ -73,6 +74,12 @@ class PartsGuard(OffPolicyAlgorithm):
         except ValueError:
             self.replay_buffer = previous
             raise
+
+    def _fit_replay_buffer(self) -> None:
+        """Let a hindsight replay buffer compute rewards by the model's environment, which may have changed."""
+        if isinstance(self.replay_buffer, HerReplayBuffer) and self.env is not None:
+            # `HerReplayBuffer.set_env` refuses a second environment
+            self.replay_buffer.env = self.env
 
     def _fit_action_noise(self, n_envs: int) -> None:
         """Adapt vectorised action noise to the number of environments, which `load` may have changed."""

@@ -12,9 +12,11 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs
 
 from sb3_cgp.guards.explanations import OLD_RESET
+from sb3_cgp.guards.observations import innermost
 
 LARGEST_FLOAT32 = np.finfo(np.float32).max
 
@@ -230,7 +232,9 @@ class TransitionGuard(OffPolicyAlgorithm):
         assert self.env is not None
         observations = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
         assert observations is not None
-        if not all(isinstance(info, dict) for info in self.env.unwrapped.reset_infos):
+        bare = innermost(self.env)
+        # Environments of other packages may keep no infos
+        if isinstance(bare, DummyVecEnv | SubprocVecEnv) and not all(isinstance(info, dict) for info in bare.reset_infos):
             raise ValueError(OLD_RESET)
         self._check(Transition(self.num_timesteps, self.observation_space, observations, None, [], self.n_envs))
 

@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
+from sb3_cgp.guards.observations import innermost
+
 SelfWorkerGuard = TypeVar("SelfWorkerGuard", bound="WorkerGuard")
 
 # Seconds that a process is given to end before it is killed, or is taken to be alive
@@ -33,7 +35,7 @@ class WorkerGuard(OffPolicyAlgorithm):
         :return: the trained model
         :raises RuntimeError: if a worker of a ``SubprocVecEnv`` has died; its environment is closed
         """
-        with _watching_workers(None if self.env is None else self.env.unwrapped) as watch:
+        with _watching_workers(innermost(self.env)) as watch:
             try:
                 return super().learn(*args, **kwargs)
             except (EOFError, ConnectionError) as error:
@@ -48,7 +50,7 @@ class WorkerGuard(OffPolicyAlgorithm):
                 raise RuntimeError(message) from error
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
-        env = None if self.env is None else self.env.unwrapped
+        env = innermost(self.env)
         if isinstance(env, SubprocVecEnv) and not env.closed:
             discard_replies(env)
         return super()._setup_learn(*args, **kwargs)
