@@ -7,7 +7,9 @@ import pickle
 import subprocess
 import sys
 import textwrap
+import warnings
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -16,9 +18,9 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 from test_callbacks import make_model
-from trainings import Do, Interruption, Stop
+from trainings import SMALL, Do, Interruption, Stop
 
 from sb3_cgp import CGP
 from sb3_cgp.common.files import write_atomically
@@ -221,3 +223,42 @@ def test_what_would_help_environments_in_other_processes(task, message):
     finally:
         processes.close()
     assert message in problem
+
+
+class OnlyGets(gym.Env):
+    """Returns its state, and cannot restore it."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float64)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1), {}
+
+    def step(self, action):
+        return np.zeros(1), 0.0, False, False, {}
+
+    def get_training_state(self):
+        return {}
+
+
+def test_a_state_that_cannot_be_set_is_an_obstacle(tmp_path):
+    model = CGP("MlpPolicy", OnlyGets(), policy_kwargs=dict(net_arch=[4]), **SMALL)
+    with pytest.warns(UserWarning, match=r"OnlyGets has a get_training_state\(\) and no set_training_state\(\)"):
+        model.learn(10, callback=TrainingCheckpointCallback(5, tmp_path))
+    with pytest.warns(UserWarning, match="state was not saved"):
+        CGP.resume(tmp_path, OnlyGets()).learn(15)
+
+
+@pytest.mark.parametrize("was_normalized", [True, False])
+def test_a_state_of_another_normalisation_is_refused_by_name(was_normalized, tmp_path):
+    plain, normalizing = DummyVecEnv([OnlyGets]), VecNormalize(DummyVecEnv([OnlyGets]))
+    before, after = (normalizing, plain) if was_normalized else (plain, normalizing)
+    model = CGP("MlpPolicy", before, policy_kwargs=dict(net_arch=[4]), **SMALL)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model.learn(10, callback=TrainingCheckpointCallback(5, tmp_path))
+    with pytest.raises(
+        ValueError, match=f"`env` is .*, but must be {'' if was_normalized else 'not '}wrapped in VecNormalize"
+    ):
+        CGP.resume(tmp_path, after)

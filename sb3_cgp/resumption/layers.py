@@ -109,6 +109,8 @@ def _own_state(layer: Any, name: str, problems: list[str]) -> Any:
     own = layer.get_training_state()
     if own is None:
         problems.append(f"{name}.get_training_state() returned None.")
+    if not hasattr(type(layer), "set_training_state"):
+        problems.append(f"{name} has a get_training_state() and no set_training_state(): it needs {METHODS}.")
     try:
         return to_plain(own)
     except NotPlainError as error:

@@ -122,16 +122,19 @@ def warn_of_unsaved(model: ResumableModel, callback: BaseCallback) -> None:
 
 def check_fits(model: ResumableModel, state: State) -> None:
     """
-    Refuse a state whose number of environments is not that of the model's environment and action noise.
+    Refuse a state of another number of environments than the model's, or of another normalisation.
 
     :param model: the loaded model
     :param state: the state
-    :raises ValueError: if a number of environments differs
+    :raises ValueError: if the number of environments differs, or only one of both has ``VecNormalize``
     """
     n_envs, saved = state["n_envs"], f"{state['n_envs']}, as was saved"
     require(model.n_envs == n_envs, "env.num_envs", model.n_envs, saved)
     noises = getattr(model.action_noise, "noises", None)
     require(noises is None or len(noises) == n_envs, "action_noise.n_envs", len(noises or ()), saved)
+    is_normalized, was_normalized = model.get_vec_normalize_env() is not None, state["statistics"] is not None
+    allowed = f"{'' if was_normalized else 'not '}wrapped in VecNormalize, as it was when the state was saved"
+    require(is_normalized == was_normalized, "env", model.env, allowed)
 
 
 def _pending(logger: Logger) -> State:
