@@ -11,7 +11,7 @@ from guarded import ACTIONS, SMALL, GuardedTD3, Located, located
 from gymnasium import spaces
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from torch import nn
 
@@ -245,3 +245,29 @@ def test_rewards_of_goals_that_are_not_those_of_a_batch_are_refused(compute_rewa
     env = type("Goals", (Located,), dict(compute_reward=compute_reward))(goals=True)
     with pytest.raises(ValueError, match=r"`env.compute_reward` is .* must be able to return the rewards of a batch"):
         GuardedTD3("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, **SMALL)
+
+
+@pytest.mark.parametrize("error", [KeyError("x"), TypeError("float() argument must be a string or a real number")])
+@pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])
+def test_rewards_that_need_more_than_empty_infos_are_not_refused(vec_env_class, error):
+    class Needy(Located):
+        def compute_reward(self, achieved, desired, info):
+            raise error
+
+    kwargs = dict(start_method="fork") if vec_env_class is SubprocVecEnv else {}
+    env = vec_env_class([lambda: Needy(goals=True)], **kwargs)
+    model = GuardedTD3("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, **SMALL | dict(learning_starts=100))
+    with pytest.warns(UserWarning, match="Nothing is learnt"):
+        model.learn(5)
+    env.close()
+
+
+@pytest.mark.parametrize("rate", [np.array(1e-3), th.tensor([1e-3])], ids=["array", "tensor"])
+def test_schedules_of_one_number_in_any_form_are_taken(rate):
+    CGP("MlpPolicy", "Pendulum-v1", learning_rate=lambda progress: rate, buffer_size=10, policy_kwargs=dict(net_arch=[4]))
+
+
+@pytest.mark.parametrize("value", [-1e-3, float("nan"), "1e-3"])
+def test_schedules_of_no_learning_rate_are_refused(value):
+    with pytest.raises(ValueError, match=r"`actor_learning_rate\(1.0\)` is .*, but must be a finite number >= 0"):
+        CGP("MlpPolicy", "Pendulum-v1", actor_learning_rate=lambda progress: value, buffer_size=10)

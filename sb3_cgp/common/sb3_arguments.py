@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -44,7 +45,10 @@ def check_learning_rate(name: str, value: Any) -> None:
         require(is_valid, name, value, f"a number >= 0, a schedule, or a string such as '{LINEAR_SCHEDULE_PREFIX}1e-3'")
     elif callable(value):
         for progress_remaining in (1.0, 0.5):
-            require_number(f"{name}({progress_remaining})", value(progress_remaining))
+            rate = value(progress_remaining)
+            # As SB3 does, which takes an array or a tensor of one number too
+            is_single = isinstance(rate, np.ndarray | th.Tensor) and math.prod(rate.shape) == 1
+            require_number(f"{name}({progress_remaining})", rate.item() if is_single else rate)
     else:
         require_number(name, value)
 

@@ -10,10 +10,12 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim, get_obs_shape
+from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cgp.common.random_state import preserved_random_state
 from sb3_cgp.common.rules import require
+from sb3_cgp.guards.observations import innermost
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
@@ -59,7 +61,9 @@ def check_goals(model: OffPolicyAlgorithm) -> None:
     if model.env is not None:
         allowed = "one with a method `compute_reward(achieved_goal, desired_goal, info)` for a HerReplayBuffer"
         require(model.env.has_attr("compute_reward"), "env", model.env, allowed)
-        _try_rewards(model)
+        # An exception in a worker process would end it
+        if isinstance(innermost(model.env), DummyVecEnv):
+            _try_rewards(model)
 
 
 def _try_rewards(model: OffPolicyAlgorithm) -> None:
@@ -73,7 +77,7 @@ def _try_rewards(model: OffPolicyAlgorithm) -> None:
         rewards = model.env.env_method("compute_reward", achieved, desired, [{}, {}], indices=[0])[0]
         is_batch = np.shape(rewards) in ((2,), (2, 1))
     except TypeError as error:
-        if "argument" not in str(error):
+        if "positional argument" not in str(error):
             return
         rewards, is_batch = f"{type(error).__name__}: {error}", False
     except Exception:

@@ -37,8 +37,9 @@ def position_of(env: VecEnv) -> tuple[Any, ...]:
     bare = innermost(env)
     if not isinstance(bare, DummyVecEnv | SubprocVecEnv):
         return ()
-    infos = bare.reset_infos
-    position = [getattr(bare, "actions", None), *(infos if isinstance(infos, list) else [infos])]
+    # A subclass may compute them anew for each reader
+    infos = vars(bare).get("reset_infos")
+    position = [vars(bare).get("actions"), *(infos if isinstance(infos, list) else [infos])]
     if isinstance(bare, DummyVecEnv):
         for each in bare.envs:
             position += _counters(each)
