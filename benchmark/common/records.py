@@ -56,6 +56,7 @@ class Record:
     :param final: mean return of the final model over ``FINAL_EPISODES`` episodes; None for a run that failed
     :param error: the error of a failed run; None for other runs
     :param seconds: wall-clock time of all attempts together
+    :param processor_seconds: time on the processor of all attempts and threads together; None where it was not measured
     """
 
     experiment: str
@@ -69,6 +70,7 @@ class Record:
     final: float | None
     error: str | None
     seconds: float | None
+    processor_seconds: float | None = None
 
     @property
     def key(self) -> str:

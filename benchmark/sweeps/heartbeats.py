@@ -26,7 +26,9 @@ class TrialLostError(RuntimeError):
     """Another process has ended this process's trial."""
 
 
-def send_beat(storage: BaseStorage, trial_id: int, count: str, step: int, seconds: float) -> None:
+def send_beat(
+    storage: BaseStorage, trial_id: int, count: str, step: int, seconds: float, processor_seconds: float = 0.0
+) -> None:
     """
     Report that this process is alive, and the progress of its trial.
 
@@ -35,9 +37,10 @@ def send_beat(storage: BaseStorage, trial_id: int, count: str, step: int, second
     :param count: a text that no earlier heartbeat had
     :param step: environment steps so far
     :param seconds: wall-clock time of this attempt so far
+    :param processor_seconds: its time on the processor, of all threads together
     :raises TrialLostError: if another process has ended the trial
     """
-    progress = {"beat": count, "step": step, "seconds": round(seconds, 1)}
+    progress = {"beat": count, "step": step, "seconds": round(seconds, 1), "processor_seconds": round(processor_seconds, 1)}
     try:
         patiently(storage.set_trial_user_attr, trial_id, PROGRESS, progress)
     except UpdateFinishedTrialError as error:
@@ -48,14 +51,15 @@ class HeartbeatThread:
     """
     A thread that reports at intervals that this process is alive, and ends the process with its parent.
 
-    :param beat: sends a heartbeat; takes a text that no earlier one had, environment steps and seconds so far
+    :param beat: sends a heartbeat; takes a text that no earlier one had, environment steps, and seconds so far by the clock
+        and on the processor
     :param interval: seconds between two heartbeats
     :param parent: the process that started this one, whose end is this one's, too; None for no such process
     """
 
-    def __init__(self, beat: Callable[[str, int, float], None], interval: float, parent: int | None = None):
+    def __init__(self, beat: Callable[[str, int, float, float], None], interval: float, parent: int | None = None):
         self._send, self._interval, self._parent = beat, interval, parent
-        self._start = time.monotonic()
+        self._start, self._processor_start = time.monotonic(), time.process_time()
         self._step = 0
         self._has_ended = threading.Event()
         self._error: BaseException | None = None
@@ -80,11 +84,14 @@ class HeartbeatThread:
         if self._error is not None:
             raise self._error
 
+    def _spent(self) -> tuple[float, float]:
+        return time.monotonic() - self._start, time.process_time() - self._processor_start
+
     def _run(self) -> None:
         beat = 0
         while self._error is None:
             try:
-                self._send(f"{os.getpid()}-{beat}", self._step, time.monotonic() - self._start)
+                self._send(f"{os.getpid()}-{beat}", self._step, *self._spent())
             except Exception as error:
                 self._error = error
             if self._parent is not None and os.getppid() != self._parent:
@@ -93,10 +100,10 @@ class HeartbeatThread:
             beat += 1
             if self._has_ended.wait(self._interval):
                 break
-        # The wall-clock time in all
+        # The time in all
         if self._error is None:
             try:
-                self._send(f"{os.getpid()}-end", self._step, time.monotonic() - self._start)
+                self._send(f"{os.getpid()}-end", self._step, *self._spent())
             except Exception as error:
                 self._error = error
 

@@ -161,7 +161,8 @@ class Ledger(StudyView):
             run, owner = by_key.get(record.key), owners.get(record.key)
             if run is None or (owner is not None and owner.state is not TrialState.WAITING):
                 continue
-            progress = {PROGRESS: {"step": record.steps, "seconds": record.seconds}, OUTCOME: "adopted"}
+            spent = {"seconds": record.seconds, "processor_seconds": record.processor_seconds}
+            progress = {PROGRESS: {"step": record.steps, **spent}, OUTCOME: "adopted"}
             trial = create_trial(
                 state=TrialState.FAIL if record.final is None else TrialState.COMPLETE,
                 value=record.final,
@@ -215,7 +216,7 @@ class Ledger(StudyView):
         except UpdateFinishedTrialError:
             return False
 
-    def beat(self, claim: Claim, count: str, step: int, seconds: float) -> None:
+    def beat(self, claim: Claim, count: str, step: int, seconds: float, processor_seconds: float = 0.0) -> None:
         """
         Report that this process is alive, and the progress of the run.
 
@@ -223,9 +224,10 @@ class Ledger(StudyView):
         :param count: a text that no earlier heartbeat had
         :param step: environment steps so far
         :param seconds: wall-clock time of this attempt so far
+        :param processor_seconds: its time on the processor, of all threads together
         :raises TrialLostError: if another process has ended the trial
         """
-        send_beat(self.storage, claim.trial_id, count, step, seconds)
+        send_beat(self.storage, claim.trial_id, count, step, seconds, processor_seconds)
 
     def report(self, claim: Claim, step: int, value: float) -> None:
         """

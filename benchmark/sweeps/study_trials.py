@@ -65,14 +65,16 @@ def attributes_of(run: Run) -> dict[str, Any]:
     return {KEY: run.key, RUN: asdict(run)}
 
 
-def seconds_of(trial: FrozenTrial) -> float:
+def seconds_of(trials: Iterable[FrozenTrial], kind: str) -> float | None:
     """
-    Return the wall-clock time of a trial.
+    Return the time that a run took.
 
-    :param trial: the trial
-    :return: seconds, as its last heartbeat reported them
+    :param trials: all trials of the run
+    :param kind: "seconds" by the clock, or "processor_seconds"
+    :return: the sum of what their last heartbeats reported; None if one of them has reported progress, but not this time
     """
-    return trial.user_attrs.get(PROGRESS, {}).get("seconds", 0.0)
+    times = [trial.user_attrs[PROGRESS].get(kind) for trial in trials if PROGRESS in trial.user_attrs]
+    return None if None in times else sum(times)
 
 
 def params_of(run: Run) -> dict[str, Any]:
@@ -112,15 +114,16 @@ def choices_of(trials: Sequence[FrozenTrial], name: str) -> list[Any]:
     return list(distribution.choices) if isinstance(distribution, CategoricalDistribution) else []
 
 
-def record_of(experiment: str, trial: FrozenTrial, seconds: float) -> Record:
+def record_of(experiment: str, trial: FrozenTrial, trials: Iterable[FrozenTrial]) -> Record:
     """
     Return the record of a run that has ended.
 
     :param experiment: the sweep's name
     :param trial: the run's own trial
-    :param seconds: wall-clock time of all its trials together
+    :param trials: all trials of the run
     :return: the record
     """
+    trials = list(trials)
     run, points = trial.user_attrs[RUN], sorted(trial.intermediate_values.items())
     return Record(
         experiment,
@@ -133,5 +136,6 @@ def record_of(experiment: str, trial: FrozenTrial, seconds: float) -> Record:
         [value for _, value in points],
         trial.value if trial.state is TrialState.COMPLETE else None,
         trial.user_attrs.get(ERROR),
-        seconds,
+        seconds_of(trials, "seconds"),
+        seconds_of(trials, "processor_seconds"),
     )

@@ -9,7 +9,7 @@ from optuna.trial import FrozenTrial
 from benchmark.common.records import Record
 from benchmark.sweeps.runs import Run, overview
 from benchmark.sweeps.storages import patiently
-from benchmark.sweeps.study_trials import COMMAND, KEY, RUN, SWEEP, choices_of, owned, record_of, seconds_of
+from benchmark.sweeps.study_trials import COMMAND, KEY, RUN, SWEEP, choices_of, owned, record_of
 
 
 class StudyView:
@@ -80,7 +80,7 @@ class StudyView:
         """
         trials = self.trials()
         experiment = self.description()["experiment"]
-        spent: dict[str, float] = defaultdict(float)
+        of_run: dict[str, list[FrozenTrial]] = defaultdict(list)
         for trial in trials:
-            spent[trial.user_attrs[KEY]] += seconds_of(trial)
-        return [record_of(experiment, trial, spent[key]) for key, trial in owned(trials).items() if trial.state.is_finished()]
+            of_run[trial.user_attrs[KEY]].append(trial)
+        return [record_of(experiment, trial, of_run[key]) for key, trial in owned(trials).items() if trial.state.is_finished()]

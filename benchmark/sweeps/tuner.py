@@ -116,8 +116,8 @@ class Tuner:
         trial = patiently(self._study.ask)
         trial_id = self._id(trial.number)
 
-        def beat(count: str, step: int, seconds: float) -> None:
-            send_beat(self._storage, trial_id, count, step, seconds)
+        def beat(count: str, step: int, *seconds: float) -> None:
+            send_beat(self._storage, trial_id, count, step, *seconds)
 
         try:
             with HeartbeatThread(beat, interval, parent) as heartbeat:
