@@ -252,15 +252,17 @@ def test_converter_rebuilds_what_the_sampler_returned(n_actions):
         sampled = zoo.sample_cgp_params(FixedTrial(parameters), n_actions, 1, NO_HER)
         # As `--trial-id` does; rl_zoo3 makes the noise from its type and standard deviation.
         converted = zoo.convert_cgp_params(parameters)
-        seen.add((parameters["noise_type"], converted["policy_loss"], converted["policy_training"], converted["cem_result"]))
+        start = parameters["cem_start"] if converted["policy_loss"] else "prior"
+        assert converted["cem_start"] == start
+        seen.add((parameters["noise_type"], converted["policy_loss"], converted["policy_training"], start))
         converted = ExperimentManager._preprocess_action_noise(rl_zoo3_manager, converted, {}, env)
 
         noise, rebuilt_noise = sampled.pop("action_noise"), converted.pop("action_noise")
         assert repr(noise) == repr(rebuilt_noise)
         assert noise().shape == (n_actions,)
         assert sampled == converted
-    # Every noise, variant and result of CEM was among them.
-    assert len(seen) == 3 * 5 * 2
+    # Every noise, variant and start of CEM was among them.
+    assert len(seen) == 3 * (4 * 2 + 1)
 
 
 def test_no_noise_takes_back_the_noise_of_a_yaml_entry(tmp_path):
