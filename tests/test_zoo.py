@@ -133,6 +133,17 @@ def test_the_default_entry_is_the_default_of_cgp():
     assert entry == {name: defaults[name] for name in entry}
 
 
+def test_the_light_entry_is_the_default_but_for_cem():
+    entries = yaml.safe_load((zoo.hyperparams_folder() / "cgp_light.yml").read_text())
+    assert entries == {"default": ENTRIES["default"] | dict(cem_start="actor", cem_iterations=1, cem_samples=16)}
+
+
+def test_a_run_takes_the_light_entry(tmp_path):
+    zoo.register()
+    model, _ = manager(tmp_path, config=str(zoo.hyperparams_folder() / "cgp_light.yml"), hyperparams=TINY).setup_experiment()
+    assert repr(model.policy.selector).startswith("ActorCEM(iterations=1, samples=16, elites=6")
+
+
 def test_every_task_has_its_entry_and_the_papers_tasks_its_configuration():
     assert set(ENTRIES) == {"default"} | PAPER_TASKS | OTHER_TASKS
     for task in PAPER_TASKS:
