@@ -13,10 +13,7 @@ import pandas as pd
 
 from benchmark.common.records import STUDY, Record, read_records
 
-LENGTH_RULE = (
-    "Where longer runs of the same experiment on the same task have all methods of shorter runs, the shorter ones are left "
-    "out."
-)
+LENGTH_RULE = "Shorter runs of an experiment on a task are left out of them where longer ones have all of their methods."
 FAILURE_RULE = (
     "A run that failed counts with the lowest return that any evaluation of any run on its task reached, and its learning "
     "curve continues at that return from its failure on."
