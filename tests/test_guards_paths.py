@@ -19,7 +19,7 @@ def assert_same_parameters(model, other):
 
 @pytest.mark.parametrize(
     ("neighbour", "kind", "name"),
-    [("export", str, "cgp_pendulum"), ("export", Path, "cgp_0.5"), ("states", str, "cgp_0.5"), ("states", Path, "cgp_pendulum")],
+    [("export", str, "cgp_pendulum"), ("export", Path, "cgp_0.5"), ("states", str, "cgp_0.5"), ("states", Path, "cgp")],
 )
 def test_a_model_and_its_buffer_are_found_beside_a_folder_of_the_same_name(name, kind, neighbour, tmp_path):
     path = kind(tmp_path / name)
