@@ -48,10 +48,13 @@ train: $(INSTALLED) ## install, train with rl_zoo3, evaluate and draw the learni
 	@plan=$$($(IN_VENV) -m benchmark.plan --algo $(ALGO) --env $(ENV) --folder "$(LOGS)" $(if $(STEPS),--steps $(STEPS)) \
 	  $(if $(PARAMS)$(ARGS),-- $(if $(PARAMS),-params $(PARAMS)) $(ARGS))) && \
 	set -- $$plan && \
-	(set -x; $(IN_VENV) -m rl_zoo3.train --algo $(ALGO) --env $(ENV) --seed $(SEED) --num-threads $(THREADS) \
+	trap 'interrupted=1' INT && \
+	(set -x; exec $(IN_VENV) -m rl_zoo3.train --algo $(ALGO) --env $(ENV) --seed $(SEED) --num-threads $(THREADS) \
 	  $(if $(STEPS),--n-timesteps $(STEPS)) \
 	  --eval-freq $(or $(EVAL_FREQ),$$1) --eval-episodes $(EVAL_EPISODES) --log-folder "$(LOGS)" --progress \
 	  $(if $(PARAMS),-params $$3 $(PARAMS),$${3:+-params $$3}) $(ARGS)) && \
+	if test -n "$$interrupted"; then \
+	  $(if $(filter cgp,$(ALGO)),echo "or  make resume RUN=\"$(LOGS)/$(ALGO)/$(subst /,-,$(ENV))_$$2\"";) exit 130; fi && \
 	$(IN_VENV) -m benchmark.report --algo $(ALGO) --env $(ENV) --folder "$(LOGS)" --exp-id $$2
 
 resume: $(INSTALLED) ## continue an interrupted run of CGP to its end, and report: make resume RUN=logs/cgp/Pendulum-v1_1

@@ -19,6 +19,8 @@ for argument; do
   case "$argument" in *" "*) printf "<%s> " "$argument" ;; *) printf "%s " "$argument" ;; esac
 done >> "$CALLS"
 echo >> "$CALLS"
+# Ctrl-C, which reaches the shell of the recipe, too
+case "$INTERRUPT$*" in yes"-m rl_zoo3.train"*) kill -INT $PPID ;; esac
 case "$*" in
   --version) echo "Python 3.9.1" ;;
   "-c import sys"*) [ -z "$OLD" ] ;;
@@ -52,7 +54,15 @@ class Clone:
         ended = subprocess.run(
             ["make", f"PYTHON={self.python}", *arguments],
             cwd=self.folder,
-            env={**inherited, "CALLS": str(self.calls_file), "FAIL": "", "OLD": "", "WARM_UP": "", **environment},
+            env={
+                **inherited,
+                "CALLS": str(self.calls_file),
+                "FAIL": "",
+                "OLD": "",
+                "WARM_UP": "",
+                "INTERRUPT": "",
+                **environment,
+            },
             capture_output=True,
             text=True,
         )
@@ -119,6 +129,16 @@ def test_failed_training_is_not_reported(clone: Clone) -> None:
     calls, ended = clone.make("train", FAIL="rl_zoo3.train")
     assert ended.returncode != 0
     assert not starting(calls, "-m benchmark.report")
+
+
+@pytest.mark.parametrize("algo", ["cgp", "td3"])
+def test_an_interrupted_training_says_how_it_is_continued(algo: str, clone: Clone) -> None:
+    calls, ended = clone.make("train", f"ALGO={algo}", "ENV=my_space/Env-v0", "LOGS=my logs", INTERRUPT="yes")
+    assert ended.returncode != 0
+    assert starting(calls, "-m rl_zoo3.train")
+    assert not starting(calls, "-m benchmark.report")
+    # Other algorithms' runs save no states
+    assert ('make resume RUN="my logs/cgp/my_space-Env-v0_4"' in ended.stdout) == (algo == "cgp")
 
 
 def test_resume_goes_on_with_the_named_run_and_reports_it(clone: Clone) -> None:

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,12 @@ from stable_baselines3.common.monitor import load_results
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_cgp import CGP
+from sb3_cgp.resumption.locks import FolderInUseError, FolderLock
 from sb3_cgp.resumption.logs import cut_monitors
 from sb3_cgp.resumption.store import StateStore
 from sb3_cgp.zoo import registration as zoo
 from sb3_cgp.zoo.resume import main
+from sb3_cgp.zoo.run_folders import LOCK_FILE
 
 EPISODE = 200
 CHECKPOINT = "{'sb3_cgp.TrainingCheckpointCallback': dict(save_freq=250)}"
@@ -215,6 +218,61 @@ def test_a_state_that_cannot_be_taken_is_named_without_a_traceback(error, monkey
     with pytest.raises(SystemExit, match=r"^Error: process 7 on another host trains in this folder$"):
         main([str(run_of(tmp_path))])
     assert (run_of(tmp_path) / "0.monitor.csv").read_bytes() == before
+
+
+class Beside(BaseCallback):
+    """Tries to resume the run that is training, as another process would."""
+
+    folder, refused = None, None
+
+    def _on_step(self):
+        if self.n_calls == 300:
+            with pytest.raises(FolderInUseError, match=r"is in use by another training: process \d+ on host"):
+                FolderLock(Beside.folder, LOCK_FILE).acquire()
+            Beside.refused = True
+        return True
+
+
+@pytest.mark.parametrize("checkpoint", ["", CHECKPOINT.replace("250", "100_000"), CHECKPOINT], ids=["none", "later", "some"])
+def test_a_run_belongs_to_one_process_from_its_start_to_its_end(checkpoint, monkeypatch, tmp_path):
+    """... with states or without, and before the first of them is saved."""
+    monkeypatch.setattr(Beside, "folder", run_of(tmp_path))
+    monkeypatch.setattr(Beside, "refused", None)
+    callbacks = ", ".join(filter(None, [checkpoint, "'test_resume_zoo.Beside'"]))
+    start(monkeypatch, command(tmp_path, callbacks=callbacks, n_timesteps=400))
+    assert Beside.refused
+    other = FolderLock(run_of(tmp_path), LOCK_FILE)
+    other.acquire()
+    (run_of(tmp_path) / "Pendulum-v1.zip").unlink()
+    before = {path: path.read_bytes() for path in run_of(tmp_path).rglob("*") if path.is_file()}
+    with pytest.raises(SystemExit, match=r"^Error: The folder .*Pendulum-v1_1 is in use by another training: process"):
+        main([str(run_of(tmp_path))])
+    assert {path: path.read_bytes() for path in run_of(tmp_path).rglob("*") if path.is_file()} == before
+    other.release()
+
+
+@pytest.mark.parametrize("error", [Interruption, KeyboardInterrupt])
+def test_a_run_that_was_interrupted_says_how_it_is_continued_and_is_free(error, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(Stop, "at", 180)
+    monkeypatch.setitem(globals(), "Interruption", error)
+    arguments = command(tmp_path, callbacks=f"{CHECKPOINT}, 'test_resume_zoo.Stop'", n_timesteps=400)
+    run = run_of(tmp_path)
+    with pytest.raises(error) if error is not KeyboardInterrupt else nullcontext():
+        start(monkeypatch, arguments)
+    stopped = "The run was interrupted at step 180 of 400."
+    assert f"{stopped} It cannot be continued, as no state of it was saved in {run / 'state'}." in capsys.readouterr().out
+    monkeypatch.setattr(Stop, "at", 330)
+    with pytest.raises(error) if error is not KeyboardInterrupt else nullcontext():
+        start(monkeypatch, arguments)
+    second = run.with_name("Pendulum-v1_2")
+    advice = f"interrupted at step 330 of 400. Continue it, from step 250, by\n  python -m sb3_cgp.zoo.resume {second}\n"
+    assert advice in capsys.readouterr().out
+    monkeypatch.setattr(Stop, "at", None)
+    resume(second)
+    said = capsys.readouterr().out
+    assert f"Resuming the training in {second / 'state'} at step 250" in said
+    assert f"{second} has ended at step 400: its final model is {second / 'Pendulum-v1.zip'}" in said
+    assert "interrupted" not in said
 
 
 def test_a_run_without_states_is_as_it_was_before(monkeypatch, tmp_path):

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import torch as th
 from stable_baselines3.common.base_class import maybe_make_env
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
@@ -21,6 +21,7 @@ from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
 from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.logs import continued_logger
 from sb3_cgp.resumption.model import ResumableModel
+from sb3_cgp.resumption.progress_bars import show_whole_training
 from sb3_cgp.resumption.replay_buffers import fill_replay_buffer
 from sb3_cgp.resumption.state import begin_new_episode, check_fits
 from sb3_cgp.resumption.store import StateStore
@@ -63,8 +64,9 @@ class ResumableAlgorithm(ResumableModel):
 
         The model's next ``learn`` continues that training: give it the arguments of the first call. Its ``total_timesteps``
         counts from the training's start, so that the training ends where it would have ended. Without a
-        ``TrainingCheckpointCallback`` among its callbacks, states are saved as before. Until ``learn`` ends or the model is
-        deleted, no other training can use the folder.
+        ``TrainingCheckpointCallback`` among its callbacks, states are saved as before. A progress bar shows the whole
+        training. With ``verbose=1``, the step is printed. Until ``learn`` ends or the model is deleted, no other training can
+        use the folder.
 
         The state holds SB3's zip, which is unpickled and can run code, as with :meth:`load`: resume your own trainings only.
 
@@ -90,6 +92,8 @@ class ResumableAlgorithm(ResumableModel):
             lock.release()
             raise
         model._folder_locks = {store.folder: lock}
+        if model.verbose >= 1:
+            print(f"Resuming the training in {path} at step {model.num_timesteps}")
         return model
 
     @classmethod
@@ -175,6 +179,9 @@ class ResumableAlgorithm(ResumableModel):
         for each in checkpoints:
             allowed = "None: give a TrainingCheckpointCallback to `learn` itself. Other callbacks do not report rollouts to it"
             require(each.parent is None, "parent", each.parent, allowed)
+        bars = [each for each in iter_callbacks(callback) if isinstance(each, ProgressBarCallback)]
+        for bar in bars if self.resumption is not None else ():
+            show_whole_training(bar, self)
         if self.resumption is not None and not checkpoints:
             callback = CallbackList([callback, TrainingCheckpointCallback(**self.resumption["checkpoint"])])
             callback.init_callback(self)

@@ -1,4 +1,4 @@
-"""Locks on folders of training states: a folder belongs to one training at a time."""
+"""Locks on folders of training states and of runs: a folder belongs to one training at a time."""
 
 import gc
 import os
@@ -10,27 +10,29 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 LOCK_FILE = ".lock"
-# A file of its own, as some versions of filelock truncate the file that they lock
-OWNER_FILE = ".lock-owner"
+# Of a file of its own, as some versions of filelock truncate the file that they lock
+OWNER_SUFFIX = "-owner"
 
 
 class FolderInUseError(RuntimeError):
-    """Another training uses the folder of training states."""
+    """Another training uses the folder."""
 
 
 class FolderLock:
     """
-    An exclusive lock on a folder of training states.
+    An exclusive lock on a folder.
 
     The operating system releases the lock when the process ends, even if it is killed. A forked process does not hold it.
 
     :param folder: the folder, which must exist
+    :param name: the name of the file that is locked
     """
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, name: str = LOCK_FILE):
         self.folder = folder
+        self._owner_file = folder / f"{name}{OWNER_SUFFIX}"
         # A model may be deleted in another thread than the one that it was resumed in
-        self._lock = FileLock(folder / LOCK_FILE, thread_local=False)
+        self._lock = FileLock(folder / name, thread_local=False)
         self._process = os.getpid()
 
     @property
@@ -55,8 +57,8 @@ class FolderLock:
                 self._acquire()
             except Timeout:
                 raise FolderInUseError(
-                    f"The folder {self.folder} is in use by another training: {self._read_owner()}. A folder of training "
-                    "states belongs to one training at a time. Wait for that training to end, stop it, or, if it is a model "
+                    f"The folder {self.folder} is in use by another training: {self._read_owner()}. A folder belongs "
+                    "to one training at a time. Wait for that training to end, stop it, or, if it is a model "
                     "in this process, delete that model."
                 ) from None
 
@@ -73,11 +75,11 @@ class FolderLock:
                 )
             return
         with suppress(OSError):
-            (self.folder / OWNER_FILE).write_text(f"process {os.getpid()} on host {socket.gethostname()}")
+            self._owner_file.write_text(f"process {os.getpid()} on host {socket.gethostname()}")
 
     def _read_owner(self) -> str:
         try:
-            return (self.folder / OWNER_FILE).read_text() or "an unknown process"
+            return self._owner_file.read_text() or "an unknown process"
         except OSError:
             return "an unknown process"
 
@@ -85,5 +87,5 @@ class FolderLock:
         """Release the lock. Do nothing if this process does not hold it."""
         if self.is_ours and self._lock.is_locked:
             with suppress(OSError):
-                (self.folder / OWNER_FILE).unlink()
+                self._owner_file.unlink()
             self._lock.release(force=True)

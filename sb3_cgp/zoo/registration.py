@@ -14,7 +14,8 @@ from sb3_cgp import CGP
 from sb3_cgp.common.extras import import_from_extra
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
 from sb3_cgp.zoo.checkpoints import prepare_checkpoints
-from sb3_cgp.zoo.folders import ALGO, hyperparams_folder
+from sb3_cgp.zoo.folders import ALGO, hyperparams_folder, state_folder
+from sb3_cgp.zoo.run_folders import hold_run, how_to_continue, release_run
 from sb3_cgp.zoo.search_space import convert_cgp_params, sample_cgp_params
 
 
@@ -93,9 +94,47 @@ def register_default_config() -> None:
     def create_callbacks_with_folder(self: Any) -> None:
         # Optuna's trials create their own callbacks, which save no states
         if not self.optimize_hyperparameters:
+            if self.algo == ALGO:
+                hold_run(self.save_path)
             prepare_checkpoints(self)
         create_callbacks(self)
         # After an error, rl_zoo3 ends the first callback, which it takes for the progress bar
         self.callbacks.sort(key=lambda callback: isinstance(callback, TrainingCheckpointCallback))
 
     ExperimentManager.create_callbacks = create_callbacks_with_folder  # type: ignore[method-assign]
+    hold_folders()
+
+
+def hold_folders() -> None:
+    """Let a run of CGP hold its folder until its model is saved, and tell how it is continued if it was interrupted."""
+    from rl_zoo3.exp_manager import ExperimentManager
+
+    learn, save_trained_model = ExperimentManager.learn, ExperimentManager.save_trained_model
+
+    @functools.wraps(learn)
+    def learn_and_release(self: Any, model: Any) -> None:
+        try:
+            learn(self, model)
+        except BaseException:
+            # After an error, or SIGTERM, no model is saved
+            _end(self, model)
+            raise
+
+    @functools.wraps(save_trained_model)
+    def save_and_release(self: Any, model: Any) -> None:
+        try:
+            save_trained_model(self, model)
+        finally:
+            _end(self, model)
+
+    def _end(experiment: Any, model: Any) -> None:
+        if experiment.algo == ALGO:
+            release_run(experiment.save_path)
+            paths = [each.path for each in experiment.callbacks if isinstance(each, TrainingCheckpointCallback)]
+            states = next(filter(None, paths), None) or state_folder(experiment.save_path)
+            advice = how_to_continue(experiment.save_path, str(states), model, experiment.n_timesteps)
+            if advice is not None:
+                print(advice, flush=True)
+
+    ExperimentManager.learn = learn_and_release  # type: ignore[method-assign]
+    ExperimentManager.save_trained_model = save_and_release  # type: ignore[method-assign]

@@ -12,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from sb3_cgp.common.extras import import_from_extra
+from sb3_cgp.zoo.run_folders import hold_run, release_run
 
 # The processes of a SubprocVecEnv import this module as Python's main module, and need rl_zoo3's patch of Gymnasium's
 # TimeLimit as they do in `rl_zoo3.train`. `resume` reports that rl_zoo3 is missing.
@@ -31,15 +32,21 @@ def resume(folder: Path) -> None:
         from sb3_cgp.zoo.resumed_run import is_finished, read_run, set_up
 
         args, hyperparams = read_run(folder)
+        # Before anything is read or written that the run's first process may change
+        hold_run(folder)
         if is_finished(folder, args, hyperparams):
+            release_run(folder)
             print(f"{folder} has ended: there is nothing to resume")
             return
         experiment, model = set_up(folder, args, hyperparams)
-    # RuntimeError and OSError: another process has locked the states
+    # RuntimeError and OSError: another process has locked the run or its states
     except (ImportError, OSError, RuntimeError, ValueError) as error:
+        release_run(folder)
         sys.exit(f"Error: {error}")
     experiment.learn(model)
     experiment.save_trained_model(model)
+    if is_finished(folder, args, hyperparams):
+        print(f"{folder} has ended at step {model.num_timesteps:,}: its final model is {folder / experiment.env_name}.zip")
 
 
 def main(argv: Sequence[str] | None = None) -> None:

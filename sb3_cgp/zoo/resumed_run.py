@@ -103,7 +103,8 @@ class ResumedExperiment(ExperimentManager):
         algorithm = resumable(ALGOS[self.algo])  # type: ignore[arg-type]
         model = algorithm.resume(states_of(Path(self.save_path), self.saved_hyperparams), env, device=self.device)
         assert model.resumption is not None
-        print(f"Resuming {self.save_path} at step {model.num_timesteps}")
+        if model.verbose < 1:
+            print(f"Resuming {self.save_path} at step {model.num_timesteps}")
         self._continue_monitors(env, model.num_timesteps, model.resumption["environment"])
         return model
 
