@@ -23,6 +23,7 @@ from sb3_cgp.fast.scoring import SCORING_DTYPES
 from sb3_cgp.guards.algorithm import GuardedAlgorithm
 from sb3_cgp.guards.losses import LossGuard
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
+from sb3_cgp.selectors.algorithm import SelectorAlgorithm
 
 SelfCGP = TypeVar("SelfCGP", bound="CGP")
 
@@ -35,6 +36,7 @@ class CGP(
     CudaGraphAlgorithm,
     LossGuard,
     LeanReplayAlgorithm,
+    SelectorAlgorithm,
     core.CGP,
 ):
     """
@@ -70,6 +72,12 @@ class CGP(
     :param cem_samples: number of actions that CEM samples per state and iteration
     :param cem_elites: number of best samples to which CEM's next iteration is fitted, at most ``cem_samples``
     :param cem_result: "best" acts by the best sample of the last iteration (the paper), "mean" by the elites' mean
+    :param cem_start: "prior" draws CEM's first samples from N(0, 1), as the paper does. "actor" takes the actor's action,
+        samples around it and samples of the prior, so that fewer suffice: ``cem_start="actor", cem_iterations=1,
+        cem_samples=16``, called CGP-Light, asks the critic for an eighth of the values. It needs an actor.
+    :param cem_actor_fraction: with ``cem_start="actor"``, the share of ``cem_samples`` drawn around the actor's action.
+        The rest, but for the actor's action itself, is drawn from the prior.
+    :param cem_actor_std: standard deviation of the samples around the actor's action, before tanh
     :param cem_dtype: data type of all layers of the critic but the last one while CEM asks it: "float32", "bfloat16", or
         "auto", which is bfloat16 on processors that multiply it natively. Values, actions and the critic's own training
         are float32 in any case.
@@ -131,6 +139,9 @@ class CGP(
         cem_samples: int = 64,
         cem_elites: int = 6,
         cem_result: str = "best",
+        cem_start: str = "prior",
+        cem_actor_fraction: float = 0.5,
+        cem_actor_std: float = 0.3,
         cem_dtype: str = "auto",
         cuda_graphs: bool = True,
         policy_loss: str | None = "cgp",
@@ -151,6 +162,9 @@ class CGP(
         _init_setup_model: bool = True,
     ):
         # The wings' arguments, which `_setup_model` reads
+        self.cem_start = cem_start
+        self.cem_actor_fraction = cem_actor_fraction
+        self.cem_actor_std = cem_actor_std
         self.cem_dtype = cem_dtype
         self.cuda_graphs = cuda_graphs
         self.diagnostics = diagnostics

@@ -70,6 +70,7 @@ CONTENDERS = {
     "CEM-4": Contender("sb3_cgp", "CGP", 1.64, 4.30, dict(policy_loss=None, cem_iterations=4)),
     "CGP-2": Contender("sb3_cgp", "CGP", 1.95, 1.0, dict(cem_iterations=2)),
     "CGP-4": Contender("sb3_cgp", "CGP", 2.55, 1.0, dict(cem_iterations=4)),
+    "CGP-Light": Contender("sb3_cgp", "CGP", kwargs=dict(cem_start="actor", cem_iterations=1, cem_samples=16)),
     "CGP-2-plain": Contender("sb3_cgp", "CGP", kwargs=dict(cem_iterations=2), policy=PlainPolicy),
     "TQC": Contender("sb3_contrib", "TQC"),
     "CrossQ": Contender("sb3_contrib", "CrossQ"),

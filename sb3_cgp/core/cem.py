@@ -92,9 +92,13 @@ class CEM:
 
     def _select_elites(self, score: Score, samples: th.Tensor) -> th.Tensor:
         """Return the elites of samples before tanh, (B, N, A), best first: (B, K, A)."""
-        values = score(samples.tanh()).nan_to_num(nan=-th.inf, posinf=th.inf, neginf=-th.inf)
-        winners = values.topk(self.elites, dim=1).indices
-        return samples.gather(1, winners.unsqueeze(2).expand(-1, -1, samples.shape[2]))
+        winners = find_elites(score(samples.tanh()), self.elites)
+        return samples.gather(1, winners.expand(-1, -1, samples.shape[2]))
+
+
+def find_elites(values: th.Tensor, n_elites: int) -> th.Tensor:
+    """Return the indices of the highest values (B, N), best first, as (B, K, 1). A NaN ranks last."""
+    return values.nan_to_num(nan=-th.inf, posinf=th.inf, neginf=-th.inf).topk(n_elites, dim=1).indices.unsqueeze(2)
 
 
 def fit_gaussian(elites: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -10,16 +10,17 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import configure_logger, polyak_update, update_learning_rate
+from stable_baselines3.common.utils import configure_logger, update_learning_rate
 from stable_baselines3.td3.policies import Actor
 from torch.nn import functional as F
 
 from sb3_cgp.common.callback_locals import learn_locals, rollout_locals, with_progress_bar
+from sb3_cgp.common.networks import update_average
 from sb3_cgp.common.rules import require, require_count
 from sb3_cgp.common.sb3_arguments import as_schedule
 from sb3_cgp.core import offline
 from sb3_cgp.core.arguments import check_arguments
-from sb3_cgp.core.cem import CEM
+from sb3_cgp.core.cem import CEM, ActionSelector
 from sb3_cgp.core.losses import POLICY_LOSSES
 from sb3_cgp.core.policies import CGPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 
@@ -137,13 +138,19 @@ class CGP(OffPolicyAlgorithm):
         self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
         if self.policy.selector is None:
-            self.policy.selector = CEM(self.cem_iterations, self.cem_samples, self.cem_elites, self.cem_result)
+            self.policy.selector = self._make_selector()
         self._choose_inference()
+
+    def _make_selector(self) -> ActionSelector:
+        return CEM(self.cem_iterations, self.cem_samples, self.cem_elites, self.cem_result)
 
     def _choose_inference(self) -> None:
         """Let ``predict`` use the network that the user chose, or CEM while no actor is trained."""
-        uses_actor = self._trains_online or (self.policy_loss is not None and self._policy_is_trained)
-        self.policy.inference = (self.inference or "actor") if uses_actor else "cem"
+        self.policy.inference = (self.inference or "actor") if self._has_actor else "cem"
+
+    @property
+    def _has_actor(self) -> bool:
+        return self._trains_online or (self.policy_loss is not None and self._policy_is_trained)
 
     @property
     def _trains_online(self) -> bool:
@@ -326,10 +333,3 @@ class CGP(OffPolicyAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
-
-
-def update_average(network: th.nn.Module, average: th.nn.Module, tau: float) -> None:
-    """Move a Polyak average towards its network, and copy batch norm's running statistics (SB3 issue #996)."""
-    polyak_update(network.parameters(), average.parameters(), tau)
-    statistics, averaged = ([x for name, x in each.named_buffers() if "running_" in name] for each in (network, average))
-    polyak_update(statistics, averaged, 1.0)

@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
+from sb3_cgp.common.networks import evaluation_mode
 from sb3_cgp.common.rules import require, require_choice
 from sb3_cgp.core.cem import ActionSelector, Score, Selection
 
@@ -79,8 +80,7 @@ class CGPPolicy(TD3Policy):
         """
         Select the actions that the first network of a critic rates highest (π_CEM of Algorithm 1).
 
-        Each observation passes the features extractor once. The critic is in evaluation mode meanwhile, so that neither
-        dropout nor batch statistics disturb the ranking and its running statistics do not change.
+        Each observation passes the features extractor once. The critic is in evaluation mode meanwhile.
 
         :param observation: a batch of B observations, as tensors
         :param critic: the critic, or the target critic
@@ -90,16 +90,15 @@ class CGPPolicy(TD3Policy):
         selector = self.selector
         require(selector is not None, "selector", selector, "an action selector, such as sb3_cgp.CEM()")
         assert selector is not None
-        was_training = critic.training
-        if was_training:
-            critic.eval()
-        try:
+        with evaluation_mode(critic):
             features = critic.extract_features(observation, critic.features_extractor)
             score = self.make_score(critic.q_networks[0], features)
-            return selector.select(score, features.shape[0], get_action_dim(self.action_space), features.device)
-        finally:
-            if was_training:
-                critic.train()
+            sizes = features.shape[0], get_action_dim(self.action_space)
+            return selector.select(score, *sizes, features.device, **self.selector_arguments(observation, critic))
+
+    def selector_arguments(self, observation: PyTorchObs, critic: ContinuousCritic) -> dict[str, Any]:
+        """Return further arguments of the selector's ``select``, of which the paper has none; subclasses override this."""
+        return {}
 
     @contextmanager
     def acting_by(self, inference: str) -> Iterator[None]:

@@ -155,9 +155,9 @@ class CudaGraphAlgorithm(CGP):
         """Return the recorded function of a gradient step or of acting; a new one if a setting has changed."""
         selector = self.policy.selector
         noise = (self.target_policy_noise, self.target_noise_clip)
-        dtype = getattr(self.policy, "cem_dtype", None)
+        policy = (getattr(self.policy, "cem_dtype", None), getattr(self.policy, "actor_proposes", None))
         # What a graph fixes when it is recorded, and a callback may change
-        settings = (self.gamma, self.tau, *noise, self.policy_loss, dtype, selector, repr(selector))
+        settings = (self.gamma, self.tau, *noise, self.policy_loss, *policy, selector, repr(selector))
         if settings != self._recorded_settings:
             self._recorded.clear()
             self._recorded_settings = settings

@@ -10,11 +10,11 @@ from stable_baselines3.td3.policies import Actor
 from torch import nn
 
 from sb3_cgp.common.rules import require_choice
-from sb3_cgp.core import policies
 from sb3_cgp.core.cem import Score
 from sb3_cgp.fast.cuda_graphs import Function
 from sb3_cgp.fast.mlp import MLP
 from sb3_cgp.fast.scoring import SCORING_DTYPES, q_score, scoring_dtype
+from sb3_cgp.selectors import policies
 
 
 class CGPPolicy(policies.CGPPolicy):

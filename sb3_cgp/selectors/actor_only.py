@@ -1,0 +1,41 @@
+"""The actor alone as a selector: without a search, CGP is TD3 or DDPG."""
+
+import torch as th
+
+from sb3_cgp.common.rules import require
+from sb3_cgp.core.cem import Score, Selection
+from sb3_cgp.selectors.proposals import SATURATION
+
+
+class ActorOnly:
+    """
+    Selects the actor's action, and never asks the critic.
+
+    With it, ``CGP(..., policy_loss="qgp", policy_delay=2)`` is TD3, and a comparison with CEM leaves all else equal.
+    """
+
+    takes_proposals = True
+
+    def __repr__(self) -> str:
+        return "ActorOnly()"
+
+    def select(
+        self,
+        score: Score,
+        n_states: int,
+        action_dim: int,
+        device: th.device | str = "cpu",
+        proposals: th.Tensor | None = None,
+    ) -> Selection:
+        """
+        Return the first proposal for each state.
+
+        The parameters are those of :class:`~sb3_cgp.selectors.ProposalSelector`.
+
+        :return: the actor's actions (B, A), and the same before tanh as the only elites (B, 1, A)
+        :raises ValueError: if there are no proposals
+        """
+        allowed = "the actions of a trained actor, for which CGP needs policy_training='online' and a `policy_loss`"
+        require(proposals is not None, "proposals", proposals, allowed)
+        assert proposals is not None
+        return Selection(actions=proposals[:, 0], elites=proposals[:, :1].clamp(-SATURATION, SATURATION).atanh())

@@ -1,0 +1,54 @@
+"""CGP whose CEM may start from the actor."""
+
+from sb3_cgp.common.rules import require, require_choice
+from sb3_cgp.core.cem import ActionSelector
+from sb3_cgp.core.cgp import CGP
+from sb3_cgp.selectors.actor_cem import ActorCEM
+from sb3_cgp.selectors.actor_only import ActorOnly
+from sb3_cgp.selectors.policies import CGPPolicy
+from sb3_cgp.selectors.proposals import check_start
+
+STARTS = ("prior", "actor")
+
+
+class SelectorAlgorithm(CGP):
+    """
+    CGP whose CEM starts from the prior, as in the paper, or from the actor.
+
+    Acting and the policy's loss start from the actor, bootstrap actions from the averaged actor. Until an offline training has
+    trained the actor, all samples are the prior's.
+    """
+
+    # The arguments of the constructor
+    cem_start: str = "prior"
+    cem_actor_fraction: float = 0.5
+    cem_actor_std: float = 0.3
+
+    def _setup_model(self) -> None:
+        require_choice("cem_start", self.cem_start, STARTS)
+        check_start(self.cem_actor_fraction, self.cem_actor_std, prefix="cem_actor_")
+        given = self.policy_kwargs.get("actor_proposes")
+        require(given is None, "policy_kwargs['actor_proposes']", given, "left out: CGP sets it when the actor is trained")
+        if self.cem_start == "actor":
+            allowed = "'prior' where `policy_loss=None` trains no actor"
+            require(self.policy_loss is not None, "cem_start", self.cem_start, allowed)
+            allowed = "'prior' with another selector than CEM, such as the one in `policy_kwargs`"
+            require(self.policy_kwargs.get("selector") is None, "cem_start", self.cem_start, allowed)
+        super()._setup_model()
+        takes_proposals = getattr(self.policy.selector, "takes_proposals", False)
+        allowed = "a subclass of sb3_cgp.CGPPolicy, whose actor can propose actions to the selector"
+        require(isinstance(self.policy, CGPPolicy) or not takes_proposals, "policy", self.policy_class, allowed)
+        if isinstance(self.policy.selector, ActorOnly):
+            reason = "with the selector ActorOnly(), whose actions are the actor's own"
+            require(self.policy_loss == "qgp", "policy_loss", self.policy_loss, f"'qgp' {reason}")
+            require(self._trains_online, "policy_training", self.policy_training, f"'online' {reason}")
+
+    def _make_selector(self) -> ActionSelector:
+        if self.cem_start == "prior":
+            return super()._make_selector()
+        sizes = self.cem_iterations, self.cem_samples, self.cem_elites, self.cem_result
+        return ActorCEM(*sizes, self.cem_actor_fraction, self.cem_actor_std)
+
+    def _choose_inference(self) -> None:
+        super()._choose_inference()
+        self.policy.actor_proposes = self._has_actor  # type: ignore[assignment]

@@ -1,0 +1,106 @@
+"""
+Proposals: actions that a selector takes into its first samples, such as the actor's.
+
+Shapes: B states, P proposals and N samples per state, A action dimensions.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch as th
+
+from sb3_cgp.common.rules import require_number
+from sb3_cgp.core.cem import ActionSelector, Score, Selection
+
+# Larger magnitudes of a proposal are clipped before samples are drawn around it: tanh would map all of them to the same action
+SATURATION = 0.99
+
+
+class ProposalSelector(ActionSelector, Protocol):
+    """An action selector that can be given proposals: its first samples include them."""
+
+    # Whether this instance wants proposals
+    takes_proposals: bool
+
+    def select(
+        self,
+        score: Score,
+        n_states: int,
+        action_dim: int,
+        device: th.device | str = "cpu",
+        proposals: th.Tensor | None = None,
+    ) -> Selection:
+        """
+        Select an action for each state.
+
+        :param score: scores N actions per state: (B, N, A) within [-1, 1] -> (B, N)
+        :param n_states: number of states, B
+        :param action_dim: number of action dimensions, A
+        :param device: the device of ``score``
+        :param proposals: actions within [-1, 1], (B, P, A); None where there is no trained actor
+        :return: the selected actions and the elites
+        """
+
+
+@dataclass(frozen=True)
+class ActorStart:
+    """
+    The rule by which the first samples start from proposals: the proposals themselves, a share around them, and the rest
+    from the prior, whose samples make the selector independent of a bad actor.
+
+    :param fraction: share of the samples that is drawn around the proposals, from 0 to 1; none are left for the prior at 1
+    :param std: standard deviation of these samples, before tanh
+    :raises ValueError: if an argument is out of its range
+    """
+
+    fraction: float = 0.5
+    std: float = 0.3
+
+    def __post_init__(self) -> None:
+        check_start(self.fraction, self.std)
+
+    def move(self, samples: th.Tensor, proposals: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Make first samples from standard normal ones.
+
+        :param samples: samples of the prior, before tanh, (B, N, A); overwritten
+        :param proposals: actions within [-1, 1], (B, P, A), of which the first N are used
+        :return: the samples before tanh, (B, N, A), in the order proposals, around them, prior; and their actions, (B, N, A),
+            which hold the proposals as they are
+        """
+        proposals = proposals[:, : samples.shape[1]]
+        n_proposals = proposals.shape[1]
+        n_around = min(round(self.fraction * samples.shape[1]), samples.shape[1] - n_proposals)
+        centres = proposals.clamp(-SATURATION, SATURATION).atanh()
+        samples[:, :n_proposals] = centres
+        if n_proposals > 1:
+            # Each of them in turn; one alone is broadcast
+            centres = centres.repeat(1, -(-n_around // n_proposals), 1)[:, :n_around]
+        samples[:, n_proposals : n_proposals + n_around].mul_(self.std).add_(centres)
+        actions = samples.tanh()
+        actions[:, :n_proposals] = proposals
+        return samples, actions
+
+
+def take(values: th.Tensor, indices: th.Tensor) -> th.Tensor:
+    """
+    Take samples of each state by their indices.
+
+    :param values: the samples, or something of each of them, (B, N, A)
+    :param indices: indices of samples, (B, K, 1)
+    :return: the chosen ones, (B, K, A)
+    """
+    return values.gather(1, indices.expand(-1, -1, values.shape[2]))
+
+
+def check_start(fraction: float, std: float, prefix: str = "") -> None:
+    """
+    Check the arguments of :class:`ActorStart`.
+
+    :param fraction: share of the samples around the proposals
+    :param std: their standard deviation
+    :param prefix: precedes the names in errors
+    :raises ValueError: if an argument is out of its range
+    """
+    require_number(f"{prefix}fraction", fraction, high=1.0)
+    require_number(f"{prefix}std", std)
