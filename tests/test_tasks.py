@@ -134,7 +134,12 @@ def test_wrong_arguments_are_named(arguments, message):
 
 @pytest.mark.parametrize(
     "space",
-    [gym.spaces.Discrete(3), gym.spaces.Box(-np.inf, np.inf, (1,)), gym.spaces.Box(0, 9, (1,), np.int64)],
+    [
+        gym.spaces.Discrete(3),
+        gym.spaces.Box(-np.inf, np.inf, (1,)),
+        gym.spaces.Box(0, 9, (1,), np.int64),
+        gym.spaces.Box(2.0, 2.0, (1,)),
+    ],
 )
 def test_other_action_spaces_are_refused(space):
     env = Recorder()
@@ -293,7 +298,7 @@ def test_cem_finds_the_higher_maximum_and_gradients_do_not(action_dim):
 def test_an_ascent_within_the_zones_ends_far_below_the_best_allowed_action(dim, share_of_best):
     """The numbers of the documentation: values that are linear in the action, whose best allowed action is a corner."""
     env = AllowedZones(Recorder(dim=dim))
-    slopes = np.random.default_rng(0).normal(size=(200, dim))
+    slopes = np.random.default_rng(0).normal(size=(100, dim))
     slopes /= np.linalg.norm(slopes, axis=1, keepdims=True)
     reached = []
     for slope in slopes:
@@ -302,7 +307,7 @@ def test_an_ascent_within_the_zones_ends_far_below_the_best_allowed_action(dim, 
             action = further
         assert env.is_allowed(np.sign(slope))
         reached.append(action @ slope / np.abs(slope).sum())
-    assert np.mean(reached) == pytest.approx(share_of_best, abs=0.02)
+    assert np.mean(reached) == pytest.approx(share_of_best, abs=0.03)
 
 
 @pytest.mark.filterwarnings("ignore:Nothing is learnt")

@@ -12,7 +12,7 @@ from scipy.stats.qmc import Sobol
 
 from sb3_cgp.common.rules import require, require_count
 
-# Points of Sobol's sequence, as a power of two; the allowed share is exact to about 1e-4
+# Points of Sobol's sequence, as a power of two; the allowed share is exact to about 1e-3
 LOG_POINTS = 16
 
 
@@ -41,8 +41,10 @@ class AllowedZones(gym.Wrapper, RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         space = env.action_space
         is_box = isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and space.is_bounded()
-        require(is_box, "env.action_space", space, "a Box of floats with finite bounds")
+        allowed = "a Box of floats with finite bounds that differ"
+        require(is_box, "env.action_space", space, allowed)
         assert isinstance(space, spaces.Box)
+        require(bool((space.low < space.high).all()), "env.action_space", space, allowed)
         require_count("levels", levels, minimum=2)
         is_number = isinstance(share, Real) and not isinstance(share, bool)
         require(is_number and 0 < share < 1, "share", share, "a number between 0 and 1, and neither of them")
