@@ -49,7 +49,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write empty files in place of pictures, for tests of what the page says."""
-    for name in ("learning_curves", "final_rewards", "stability", "sensitivity", "values"):
+    for name in ("curves_by_steps", "curves_by_minutes", "final_rewards", "stability", "sensitivity", "values"):
         monkeypatch.setattr(command, name, lambda *args: b"")
 
 

@@ -1,4 +1,4 @@
-"""The figures of a study: learning curves, stability, sensitivity to each axis, final rewards."""
+"""The figures of a study: stability, sensitivity to each axis, final rewards."""
 
 import io
 from collections.abc import Sequence
@@ -75,48 +75,34 @@ def legend(figure: Figure, panel: Sequence[Axes], title: str | None = None) -> N
     :param title: title of the legend
     """
     entries = {label: handle for axes in panel for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    # An entry is about as wide as half a panel
-    columns = max(min(len(entries), int(figure.get_figwidth() / PANEL[0] * 2.3)), 1)
+    # An entry is about as wide as half a panel, and wider with a long label; inches, at the usual size of letters
+    widest = max(PANEL[0] / 2.3, 0.85 + 0.085 * max(map(len, entries), default=0))
+    columns = max(min(len(entries), int(figure.get_figwidth() / widest)), 1)
     look: dict[str, Any] = dict(loc="outside upper center", ncols=columns, frameon=False, handlelength=3.2)
     figure.legend(list(entries.values()), list(entries), title=title, **look)
 
 
-def learning_curves(study: Study, task: str, repetitions: int = REPETITIONS) -> bytes:
+def draw_line(panel: Axes, x: np.ndarray, y: np.ndarray, label: str, look: dict[str, Any], drawstyle: Any = None) -> None:
     """
-    Draw a task's learning curves: mean and range over seeds, as the paper, and interquartile mean with its 95 % interval.
+    Draw a line with a few markers.
 
-    :param study: the study
-    :param task: the task
-    :param repetitions: number of bootstrap samples
-    :return: the picture, as PNG
+    :param panel: the panel
+    :param x: abscissae (E)
+    :param y: ordinates (E)
+    :param label: the line's name in the legend
+    :param look: Matplotlib's colour, line style and marker
+    :param drawstyle: Matplotlib's drawing style, such as "steps-pre"; None for straight lines between points
     """
-    figure, (left, right) = panels(2)
-    floor, grid = floors(study.records)[task], evaluation_grid(study.records, task)
-    for method, look in styles(study.methods).items():
-        records = [record for record in study.records if (record.method, record.task) == (method, task)]
-        if not records or len(grid) == 0:
-            continue
-        lines = curves(records, floor, grid)
-        _line(left, grid, lines.mean(axis=0), method, look)
-        left.fill_between(grid, lines.min(axis=0), lines.max(axis=0), color=look["color"], alpha=0.12, linewidth=0)
-        middle, interval = bootstrap(interquartile_mean, [[lines]], repetitions)
-        _line(right, grid, middle, method, look)
-        if interval is not None:
-            right.fill_between(grid, *interval, color=look["color"], alpha=0.12, linewidth=0)
-    left.set(title="mean, and range over seeds", ylabel="return")
-    right.set(title="interquartile mean, 95 % interval")
-    for panel in (left, right):
-        _label_steps(panel)
-    legend(figure, [left], task)
-    return png(figure)
-
-
-def _line(panel: Axes, x: np.ndarray, y: np.ndarray, label: str, look: dict[str, Any], drawstyle: Any = None) -> None:
     every = max(1, len(x) // MARKS)
     panel.plot(x, y, label=label, **look, drawstyle=drawstyle, markevery=every, markersize=4, linewidth=1.4)
 
 
-def _label_steps(panel: Axes) -> None:
+def label_steps(panel: Axes) -> None:
+    """
+    Label the horizontal axis with environment steps.
+
+    :param panel: the panel
+    """
     panel.set_xlabel("environment steps")
     panel.xaxis.set_major_formatter(EngFormatter(sep=""))
 
@@ -142,7 +128,7 @@ def stability(table: pd.DataFrame, methods: Sequence[str], repetitions: int = RE
                 continue
             share, band = bootstrap(lambda scores, levels=levels: share_reaching(scores, levels), [cells], repetitions)
             for axes in (whole, closer):
-                _line(axes, levels, 100 * share, method, look, drawstyle="steps-pre")
+                draw_line(axes, levels, 100 * share, method, look, drawstyle="steps-pre")
                 if band is not None:
                     axes.fill_between(
                         levels, 100 * band[0], 100 * band[1], step="pre", color=look["color"], alpha=0.12, linewidth=0
@@ -187,9 +173,9 @@ def sensitivity(study: Study, task: str) -> bytes:
             ]
             if records and len(grid) > 0:
                 label = " / ".join(value_in_words(value) for value in settings.values())
-                _line(panel, grid, curves(records, floor, grid).mean(axis=0), label, look)
+                draw_line(panel, grid, curves(records, floor, grid).mean(axis=0), label, look)
         panel.set(title=method, ylabel="return")
-        _label_steps(panel)
+        label_steps(panel)
     legend(figure, drawn, f"{task}: {' / '.join(axis_in_words(axis) for axis in study.axes)}")
     return png(figure)
 
