@@ -12,6 +12,7 @@ from typing import Any
 
 from benchmark.common.records import RUNS
 from benchmark.reporting.claims import NOT_THE_PAPERS, findings
+from benchmark.reporting.comparisons import experiments_section
 from benchmark.reporting.drawing import final_rewards, sensitivity, stability, values
 from benchmark.reporting.estimates import REPETITIONS
 from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, timed_runs
@@ -73,7 +74,8 @@ def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPE
         papers = [study for study in in_earnest if study.facts["experiment"] not in NOT_THE_PAPERS]
         found = findings(score_table(papers), read_runtime(), repetitions)
         command = command_line(folders, out, repetitions)
-        sections = [f"`{command}` writes this page.", claims_section(found), *filter(None, [light_section(studies)])]
+        answers = [light_section(studies), experiments_section(in_earnest, repetitions)]
+        sections = [f"`{command}` writes this page.", claims_section(found), *filter(None, answers)]
         sections += [pooled_section(picture, f"{command} {FIGURES_ONLY}") for picture in together]
         for study, own in zip(studies, pictures, strict=True):
             # A study's figures depend on nothing else
