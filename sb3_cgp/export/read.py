@@ -4,6 +4,7 @@ Loading an exported policy from safetensors and JSON, which hold data and no cod
 The files may come from an unknown source, see :mod:`sb3_cgp.export.description`.
 """
 
+import errno
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
@@ -108,8 +109,13 @@ def load_weights(folder: str | Path) -> ExportedPolicy:
     :return: the policy
     :raises ValueError: if a file is damaged or of another export, or an entry is not allowed; it names the file and the reason
     :raises FileNotFoundError: if ``policy.json`` or ``policy.safetensors`` is missing
+    :raises NotADirectoryError: if the folder is a file
     :raises ImportError: if safetensors is not installed
     """
+    if Path(folder).is_file():
+        raise NotADirectoryError(
+            errno.ENOTDIR, "Is a file, and no folder that `export` wrote; `load` reads a model", str(folder)
+        )
     safetensors = import_from_extra("safetensors", "export", PURPOSE)
     safetensors_torch = import_from_extra("safetensors.torch", "export", PURPOSE)
     paths = {name: Path(folder) / name for name in (DESCRIPTION_FILE, TENSORS_FILE, ONNX_FILE)}

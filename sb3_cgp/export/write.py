@@ -1,5 +1,6 @@
 """Exporting a policy: as ONNX, to act elsewhere, and as safetensors and JSON, to be loaded without pickle."""
 
+import errno
 import hashlib
 import json
 import logging
@@ -66,8 +67,11 @@ def export_policy(model: ExportableModel, folder: str | Path) -> None:
     :param model: the model
     :param folder: the folder for the files; it is created if it is missing
     :raises ValueError: if the policy cannot be exported, naming the obstacle and what is allowed
+    :raises FileExistsError: if the folder is a file
     :raises ImportError: if a package of the ``export`` extra is not installed
     """
+    if Path(folder).is_file():
+        raise FileExistsError(errno.EEXIST, "Is a file, and must be a folder or a new name", str(folder))
     names = ("safetensors.torch", "onnxruntime", "onnx", "onnxscript")
     safetensors_torch, onnxruntime, *_ = (import_from_extra(name, "export", PURPOSE) for name in names)
     normalizer = _normalizer(model)
