@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import pickle
+import re
 import shutil
 import struct
 import zipfile
@@ -28,6 +29,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from torch import nn
 
 from sb3_cgp import CGP
+from sb3_cgp.common.extras import how_to_install
 from sb3_cgp.export import boxes
 from sb3_cgp.export import description as exported
 from sb3_cgp.export.boxes import describe_box
@@ -437,8 +439,9 @@ def test_missing_extra_is_named(missing, tmp_path, monkeypatch):
 
     model = make_model()
     monkeypatch.setattr("importlib.import_module", import_module)
-    remedy = r'pip install "sb3-cgp\[export\]" \(in a clone: pip install -e "\.\[export\]"\)'
-    with pytest.raises(ImportError, match=rf"needs {missing}, which is not installed: {remedy}"):
+    remedy = re.escape(how_to_install("export"))
+    assert '".[export]"' in how_to_install("export")
+    with pytest.raises(ImportError, match=rf"needs {missing}, which is not installed. It is in the extra `export`: {remedy}"):
         model.export(tmp_path)
     if missing == "safetensors":
         with pytest.raises(ImportError, match=remedy):
