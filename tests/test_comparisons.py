@@ -19,6 +19,7 @@ from benchmark.reporting.comparisons import (
     TOO_FEW,
     difference_in_words,
     differences_table,
+    experiments_section,
     pairs_of,
 )
 from benchmark.reporting.estimates import Estimate, welch
@@ -119,6 +120,35 @@ def test_differences_on_each_task_and_on_all_that_have_enough_runs(tmp_path: Pat
     assert (word, number) == (HIGHER, "8 and 8")
     assert found["all tasks (2)", "CGP-Online − TD3"][1] == NOT_DISTINGUISHABLE
     assert not any("Random" in pair for _, pair in found)
+
+
+def test_tasks_in_studies_of_their_own_are_compared_together(tmp_path: Path) -> None:
+    """The rows are those of one study with all tasks, and an experiment of one study has none."""
+    draw = np.random.default_rng(0)
+
+    def of(task: str, experiment: str) -> list[Record]:
+        return [
+            replace(record(method, seed, float(draw.normal(mean, 1)), task=task), experiment=experiment)
+            for method, mean in (("CGP-Online", 5.0), ("TD3", 2.0))
+            for seed in range(4)
+        ]
+
+    pendulum, reacher = of("Pendulum-v1", "e1"), of("Reacher-v5", "e1")
+    alone = study(tmp_path, of("Hopper-v5", "e10-quick"), "alone")
+    first, second = study(tmp_path, pendulum, "first"), study(tmp_path, reacher, "second")
+    for each in (first, second, alone):
+        each.facts["experiment"] = each.records[0].experiment
+    together = study(tmp_path, pendulum + reacher, "together")
+    section = experiments_section([first, second, alone], 500)
+    assert "E1, the studies first, second:" in section
+    assert "E10" not in section
+    table = section[section.index("|") :]
+    ((pair, found),) = rows(table).items()
+    expected = rows(differences_table(score_table([together]), together.methods, 500))[pair]
+    assert pair == ("all tasks (2)", "CGP-Online − TD3")
+    assert found[0].split()[0] == expected[0].split()[0]
+    assert found[1:] == expected[1:] == [HIGHER, "8 and 8"]
+    assert experiments_section([first], 500) == experiments_section([alone], 500) == ""
 
 
 def test_one_task_is_not_all_tasks(tmp_path: Path) -> None:

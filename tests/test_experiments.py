@@ -124,7 +124,7 @@ def test_the_documented_sweep_is_one(tmp_path):
     samples = {run.hyperparams.get("cem_samples") for run in runs if run.method == "CGP"}
     assert samples == {16, 64, 256}
     assert not any("cem_samples" in run.hyperparams for run in runs if run.method == "TQC")
-    rows = dict(re.findall(r"\| `(e\d)` .*\| (\d+) \|", documentation))
+    rows = dict(re.findall(r"\| `(e\d+)` .*\| (\d+) \|", documentation))
     assert {name: str(sum(len(load_sweep(each).runs()) for each in included_sweeps(name))) for name in rows} == rows
 
 

@@ -15,9 +15,11 @@ from benchmark.reporting.estimates import (
     probability_of_improvement,
     welch,
 )
+from benchmark.reporting.scores import Study, score_table
 from benchmark.reporting.verdicts import LIGHT, OURS
 
 RANDOM = "Random"
+HEADER = ["task", "difference", "of means (95 % interval)", "the first is", "runs"]
 HIGHER, LOWER, NOT_DISTINGUISHABLE, TOO_FEW = "higher", "lower", "not distinguishable", "too few seeds"
 DIFFERENCES_RULE = f"""\
 In tables of differences, each row has the first method's mean final reward less the second's. The intervals of single tasks
@@ -99,6 +101,20 @@ def differences_table(table: pd.DataFrame, methods: Sequence[str], repetitions: 
             found = task_difference(table, task, pair)
             if found is not None:
                 rows.append(_row(task, pair, found, form, table[table["task"] == task]))
+    rows += pooled_rows(table, methods, repetitions)
+    return markdown_table(HEADER, rows) if rows else ""
+
+
+def pooled_rows(table: pd.DataFrame, methods: Sequence[str], repetitions: int = REPETITIONS) -> list[list[str]]:
+    """
+    Return the rows of a table of differences that are on all tasks together.
+
+    :param table: the scores of runs without axes, of one study or of several
+    :param methods: the methods, in order
+    :param repetitions: number of bootstrap samples
+    :return: the rows; none for pairs that fewer than two tasks have enough runs of
+    """
+    tasks, rows = list(dict.fromkeys(table["task"])), []
     for pair in pairs_of(methods):
         singles = {task: task_difference(table, task, pair) for task in tasks}
         enough = [task for task, found in singles.items() if found is not None and found.runs >= FEWEST_RUNS]
@@ -106,8 +122,30 @@ def differences_table(table: pd.DataFrame, methods: Sequence[str], repetitions: 
         pooled = compare(runs, pair, mean_difference, repetitions=repetitions)
         if len(enough) > 1 and pooled is not None:
             rows.append(_row(f"all tasks ({len(enough)})", pair, pooled, ".3f", runs))
-    header = ["task", "difference", "of means (95 % interval)", "the first is", "runs"]
-    return markdown_table(header, rows) if rows else ""
+    return rows
+
+
+def experiments_section(studies: Sequence[Study], repetitions: int = REPETITIONS) -> str:
+    """
+    Compare methods on all tasks of an experiment whose tasks are studies of their own.
+
+    :param studies: the studies, without those of shorter trial runs
+    :param repetitions: number of bootstrap samples
+    :return: the section, in Markdown; empty if no experiment without axes has several studies with enough runs
+    """
+    families: dict[str, list[Study]] = {}
+    for study in studies:
+        if not study.axes:
+            # The files of one experiment are named after it: e10-quick, e10-locomotion
+            families.setdefault(study.facts["experiment"].split("-")[0], []).append(study)
+    parts = []
+    for family, members in families.items():
+        methods = list(dict.fromkeys(method for study in members for method in study.methods))
+        rows = pooled_rows(score_table(members), methods, repetitions) if len(members) > 1 else []
+        if rows:
+            names = ", ".join(study.name for study in members)
+            parts += [f"{family.upper()}, the studies {names}:", markdown_table(HEADER, rows)]
+    return "\n\n".join(["## Differences on all tasks of an experiment", *parts]) if parts else ""
 
 
 def _row(task: str, pair: tuple[str, str], found: Estimate, form: str, runs: pd.DataFrame) -> list[str]:

@@ -12,6 +12,7 @@ from typing import Any
 
 from benchmark.common.records import RUNS
 from benchmark.reporting.claims import NOT_THE_PAPERS, findings
+from benchmark.reporting.comparisons import experiments_section
 from benchmark.reporting.drawing import final_rewards, sensitivity, stability, values
 from benchmark.reporting.estimates import REPETITIONS
 from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, timed_runs
@@ -27,7 +28,7 @@ PAGE = "results.md"
 FIGURES = "figures"
 FIGURES_ONLY = "--figures-only"
 CURVES = (
-    "Learning curves on {}: mean and range over seeds (left), interquartile mean and 95 % interval (right). "
+    "Learning curves on {}: every seed (thin), the interquartile mean over seeds (bold), and its 95 % interval (band). "
     "Until an offline variant's policy is trained, at the end, its curve is CEM's."
 )
 LITERATURE = " Hollow markers are mean returns from the literature, on other versions of the environment (table below)."
@@ -35,7 +36,10 @@ MINUTES = (
     "The same on {} by minutes of processor time, of all threads, evaluations included. A run's evaluation is placed at the "
     "run's time times the evaluation's step divided by the run's steps, and a method's curve at the mean over its runs."
 )
-STABILITY = "Stability: the share of runs, {}, that reach at least a final reward, with pointwise 95 % bands."
+STABILITY = (
+    "Stability: the share of runs, {}, that reach at least a final reward, with pointwise 95 % bands, "
+    "from the lowest reward on at which methods are more than 10 % apart."
+)
 
 
 def study_folders(out: Path = FOLDER) -> list[Path]:
@@ -73,7 +77,8 @@ def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPE
         papers = [study for study in in_earnest if study.facts["experiment"] not in NOT_THE_PAPERS]
         found = findings(score_table(papers), read_runtime(), repetitions)
         command = command_line(folders, out, repetitions)
-        sections = [f"`{command}` writes this page.", claims_section(found), *filter(None, [light_section(studies)])]
+        answers = [light_section(studies), experiments_section(in_earnest, repetitions)]
+        sections = [f"`{command}` writes this page.", claims_section(found), *filter(None, answers)]
         sections += [pooled_section(picture, f"{command} {FIGURES_ONLY}") for picture in together]
         for study, own in zip(studies, pictures, strict=True):
             # A study's figures depend on nothing else
@@ -148,7 +153,7 @@ def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
     caption = STABILITY.format("of all configurations and seeds")
     pictures = [picture("stability", caption, stability(table, study.methods, repetitions))]
     for task in study.tasks:
-        lines = f"Sensitivity to {axes} on {task}: learning curves, means over seeds."
+        lines = f"Sensitivity to {axes} on {task}: learning curves, means over seeds, on one vertical scale."
         pictures.append(picture("sensitivity", lines, sensitivity(study, task), task))
         points = f"Final rewards on {task} by {axes}: interquartile means over all runs with a value, and 95 % intervals."
         pictures.append(picture("values", points, values(study, table, task, repetitions), task))

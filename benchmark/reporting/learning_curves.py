@@ -1,6 +1,7 @@
 """Learning curves: by environment steps, beside published returns, and by minutes of processor time."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,16 +9,24 @@ from matplotlib.figure import Figure
 
 from benchmark.common.records import Record
 from benchmark.common.style import styles
-from benchmark.reporting.drawing import draw_line, label_steps, legend, panels, png
+from benchmark.reporting.canvas import BAND, SEED, draw_line, label_steps, legend, panels, png, styled
+from benchmark.reporting.comparisons import RANDOM
 from benchmark.reporting.estimates import REPETITIONS, bootstrap, interquartile_mean
-from benchmark.reporting.literature import published
+from benchmark.reporting.literature import Published, published
 from benchmark.reporting.scores import Study, curves, evaluation_grid, failed, floors
 
+# The most curves in one panel; a study of more methods has a panel for each, beside the same reference
+MOST = 4
+REFERENCE = "TD3"
+BESIDE: dict[str, Any] = dict(color="#8A8A8A", linestyle="--", linewidth=1.6)
+ALONE = (6.6, 4.0)
 
+
+@styled
 def curves_by_steps(study: Study, task: str, repetitions: int = REPETITIONS) -> bytes:
     """
-    Draw a task's learning curves: mean and range over seeds, as the paper, and interquartile mean with its 95 % interval.
-    Published mean returns within the range of steps are hollow markers beside the means.
+    Draw a task's learning curves: every seed, their interquartile mean, and its 95 % interval. Published mean returns within
+    the range of steps are hollow markers.
 
     :param study: the study
     :param task: the task
@@ -26,20 +35,20 @@ def curves_by_steps(study: Study, task: str, repetitions: int = REPETITIONS) -> 
     """
     records = [record for record in study.records if record.task == task]
     figure, drawn = _figure(study, task, records, dict.fromkeys(study.methods, 1.0), repetitions)
-    for panel in drawn:
+    for panel in drawn.values():
         label_steps(panel)
     for entry in published(task, study.facts["steps"]):
-        (look,) = styles([entry.method]).values()
-        steps, means = list(entry.returns), [mean for mean, _ in entry.returns.values()]
-        marks = dict(look, linestyle="none", markerfacecolor="none", markersize=8, markeredgewidth=1.6, clip_on=False)
-        drawn[0].plot(steps, means, label=f"{entry.method}, literature, {entry.version}", **marks)
-    legend(figure, drawn[:1], task)
+        place = entry.method if entry.method in drawn else ""
+        if place in drawn:
+            _mark(drawn[place], entry)
+    legend(figure, list(drawn.values()), task)
     return png(figure)
 
 
+@styled
 def curves_by_minutes(study: Study, task: str, repetitions: int = REPETITIONS) -> bytes:
     """
-    Draw a task's learning curves by processor time: the same means and intervals, without runs that have no time.
+    Draw a task's learning curves by processor time: the same, without runs that have no time.
 
     :param study: the study
     :param task: the task, of which :func:`timed_runs` finds runs
@@ -48,9 +57,9 @@ def curves_by_minutes(study: Study, task: str, repetitions: int = REPETITIONS) -
     """
     records, minutes_per_step = timed_runs(study, task)
     figure, drawn = _figure(study, task, records, minutes_per_step, repetitions)
-    for panel in drawn:
+    for panel in drawn.values():
         panel.set_xlabel("minutes of processor time")
-    legend(figure, drawn[:1], task)
+    legend(figure, list(drawn.values()), task)
     return png(figure)
 
 
@@ -75,26 +84,59 @@ def timed_runs(study: Study, task: str) -> tuple[list[Record], dict[str, float]]
     return [record for record in measured if record.method in paces], paces
 
 
+def shown_methods(study: Study, task: str) -> list[str]:
+    """
+    List the methods that a task's learning curves show.
+
+    :param study: the study
+    :param task: the task
+    :return: those that have runs, without random actions, whose level would squash the others' curves
+    """
+    ran = {record.method for record in study.records if record.task == task}
+    learners = [method for method in study.methods if method in ran and method != RANDOM]
+    return learners or [method for method in study.methods if method in ran]
+
+
 def _figure(
     study: Study, task: str, records: Sequence[Record], units_per_step: Mapping[str, float], repetitions: int
-) -> tuple[Figure, list[Axes]]:
-    """Draw both statistics of each method's runs against its steps in some unit."""
-    figure, (left, right) = panels(2)
+) -> tuple[Figure, dict[str, Axes]]:
+    """Draw each method's runs against its steps in some unit. The panels are by method, or the only one is that of all, ""."""
+    by_method = {method: [record for record in records if record.method == method] for method in shown_methods(study, task)}
+    by_method = {method: runs for method, runs in by_method.items() if runs}
     floor, grid = floors(study.records)[task], evaluation_grid(records, task)
-    for method, look in styles(study.methods).items():
-        runs = [record for record in records if record.method == method]
-        if not runs or len(grid) == 0:
+    lines = {method: curves(runs, floor, grid) for method, runs in by_method.items()}
+    looks = styles(study.methods)
+    is_alone = len(by_method) <= MOST
+    figure, axes = panels(1, size=ALONE) if is_alone else panels(len(by_method), columns=3)
+    drawn = {"": axes[0]} if is_alone else dict(zip(by_method, axes, strict=True))
+    reference = REFERENCE if REFERENCE in by_method else next(iter(by_method))
+    for method, runs in by_method.items():
+        panel, x = drawn["" if is_alone else method], grid * units_per_step[method]
+        if len(grid) == 0:
             continue
-        x, lines = grid * units_per_step[method], curves(runs, floor, grid)
-        draw_line(left, x, lines.mean(axis=0), _label(study, method, runs), look)
-        left.fill_between(x, lines.min(axis=0), lines.max(axis=0), color=look["color"], alpha=0.12, linewidth=0)
-        middle, interval = bootstrap(interquartile_mean, [[lines]], repetitions)
-        draw_line(right, x, middle, method, look)
+        if not is_alone:
+            panel.set_title(_label(study, method, runs))
+            if method != reference:
+                beside = interquartile_mean(lines[reference][None])[0]
+                panel.plot(grid * units_per_step[reference], beside, label=f"{reference}, in all panels", **BESIDE)
+        panel.plot(x, lines[method].T, color=looks[method]["color"], label="_seed", **SEED)
+        middle, interval = bootstrap(interquartile_mean, [[lines[method]]], repetitions)
+        label, look = (
+            (_label(study, method, runs), looks[method]) if is_alone else ("_method", looks[method] | {"linestyle": "-"})
+        )
+        draw_line(panel, x, middle, label, look)
         if interval is not None:
-            right.fill_between(x, *interval, color=look["color"], alpha=0.12, linewidth=0)
-    left.set(title="mean, and range over seeds", ylabel="return")
-    right.set(title="interquartile mean, 95 % interval")
-    return figure, [left, right]
+            panel.fill_between(x, *interval, color=looks[method]["color"], **BAND)
+    for panel in axes[:: 1 if is_alone else 3]:
+        panel.set_ylabel("return")
+    return figure, drawn
+
+
+def _mark(panel: Axes, entry: Published) -> None:
+    (look,) = styles([entry.method]).values()
+    steps, means = list(entry.returns), [mean for mean, _ in entry.returns.values()]
+    marks = dict(look, linestyle="none", markerfacecolor="none", markersize=9, markeredgewidth=1.8, clip_on=False)
+    panel.plot(steps, means, label=f"{entry.method}, literature, {entry.version}", **marks)
 
 
 def _label(study: Study, method: str, runs: Sequence[Record]) -> str:

@@ -6,6 +6,7 @@ A file's keys are the fields of :class:`~benchmark.sweeps.sweep_files.SweepFile`
 
 import functools
 import itertools
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -125,9 +126,14 @@ def find_sweep_file(name: str) -> Path:
     """
     path = Path(name) if name.endswith((".yml", ".yaml")) else sweeps_folder() / f"{name}.yml"
     if not path.is_file() or path.name == METHODS_FILE:
-        known = sorted(each.stem for each in sweeps_folder().glob("*.yml") if each.name != METHODS_FILE)
+        known = sorted((each.stem for each in sweeps_folder().glob("*.yml") if each.name != METHODS_FILE), key=_with_numbers)
         raise SweepError(name, "", f"no such sweep: must be one of {', '.join(known)}, or the path of a .yml file")
     return path
+
+
+def _with_numbers(name: str) -> list[str | int]:
+    """Return a key by which e2 comes before e10."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
 
 
 def included_sweeps(name: str) -> list[str]:
