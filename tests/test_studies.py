@@ -21,7 +21,7 @@ from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.heartbeats import PROGRESS, TrialLostError
 from benchmark.sweeps.storages import open_storage, patiently
 from benchmark.sweeps.studies import Ledger
-from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME, WORKER
+from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME, WORKER, distributions_of, with_seed
 from benchmark.sweeps.validation import SweepError
 from benchmark.sweeps.worker_loop import execute_runs
 
@@ -257,6 +257,28 @@ def test_a_study_may_get_more_seeds_and_more_of_its_methods(ledger):
     assert [trial.user_attrs["run"]["seed"] for trial in ledger.trials()] == [0, 1, 2, 3, 4]
     open_ledger(ledger.storage, Clock(), methods=["Other"], seeds=[7])
     assert ledger.trials()[-1].user_attrs[KEY] == "Other,Pendulum-v1,seed=7"
+
+
+def test_a_trial_shows_its_name_and_its_seed_and_the_seed_is_no_parameter(ledger):
+    """optuna-dashboard shows attributes as columns, sorts by numbers, and takes parameters alone for its importances."""
+    assert [set(trial.params) for trial in ledger.trials()] == [{"method", "task"}] * 3
+    assert [trial.user_attrs["seed"] for trial in ledger.trials()] == [0, 1, 2]
+    assert ledger.trials()[0].user_attrs[KEY] == "Good,Pendulum-v1,seed=0"
+
+
+def test_a_study_of_an_earlier_version_goes_on_with_the_seed_as_a_parameter(monkeypatch):
+    storage = InMemoryStorage()
+    with monkeypatch.context() as patch:
+        patch.setattr("benchmark.sweeps.studies.distributions_of", lambda sweep: with_seed(distributions_of(sweep)))
+        first = open_ledger(storage, Clock())
+    assert [trial.params["seed"] for trial in first.trials()] == [0, 1, 2]
+    claim = first.claim("worker")
+    first.release(claim)
+    later = open_ledger(storage, Clock(), seeds=4)
+    assert [trial.params["seed"] for trial in later.trials()] == [0, 1, 2, 0, 3]
+    assert len({str(trial.distributions) for trial in later.trials()}) == 1
+    with pytest.raises(SweepError, match="has other methods, tasks or axes"):
+        open_ledger(storage, Clock(), tasks=["Reacher-v5"])
 
 
 def test_hyperparameters_that_json_changes_are_the_same(ledger):

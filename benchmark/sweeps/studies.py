@@ -47,6 +47,7 @@ from benchmark.sweeps.study_trials import (
     distributions_of,
     owned,
     params_of,
+    with_seed,
 )
 from benchmark.sweeps.study_view import StudyView
 from benchmark.sweeps.validation import SweepError
@@ -82,6 +83,9 @@ class Ledger(StudyView):
             self._study_id = None
         runs, trials = sweep.runs(), self.trials()
         self._distributions = distributions_of(sweep)
+        if trials and trials[0].distributions == with_seed(self._distributions):
+            # Optuna gives all trials of a study the same parameters
+            self._distributions = with_seed(self._distributions)
         self._check(runs, trials)
         commands = description.get("commands", [])
         facts = {key: value for key, value in description.items() if key != "commands"}
@@ -144,7 +148,7 @@ class Ledger(StudyView):
                 keys.add(run.key)
                 trial = create_trial(
                     state=TrialState.WAITING,
-                    params=params_of(run),
+                    params=params_of(run, distributions),
                     distributions=distributions,
                     user_attrs=attributes_of(run),
                 )
@@ -168,7 +172,7 @@ class Ledger(StudyView):
             trial = create_trial(
                 state=TrialState.FAIL if record.final is None else TrialState.COMPLETE,
                 value=record.final,
-                params=params_of(run),
+                params=params_of(run, self._distributions),
                 distributions=self._distributions,
                 user_attrs=attributes_of(run) | progress | ({} if record.error is None else {ERROR: record.error}),
                 intermediate_values=dict(zip(record.timesteps, record.returns, strict=True)),

@@ -1,6 +1,6 @@
 """The trials of a study: the attributes that describe a run, and the rule which of a run's trials is its own."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -16,6 +16,9 @@ from benchmark.sweeps.runs import Run
 SWEEP, COMMAND = "sweep", "command "
 # Attributes of a trial
 RUN, KEY, ERROR, WORKER, OUTCOME = "run", "key", "error", "worker", "outcome"
+# The seed is an attribute, for optuna-dashboard to show and sort by. As a parameter, it would take part in the importances of
+# parameters. Studies that earlier versions began have it as a parameter, too.
+SEED = "seed"
 
 
 @dataclass(frozen=True)
@@ -60,9 +63,9 @@ def attributes_of(run: Run) -> dict[str, Any]:
     Return the attributes of a run's trials.
 
     :param run: the run
-    :return: its key, and all of its fields
+    :return: its key, which is its name in optuna-dashboard, its seed, and all of its fields
     """
-    return {KEY: run.key, RUN: asdict(run)}
+    return {KEY: run.key, SEED: run.seed, RUN: asdict(run)}
 
 
 def seconds_of(trials: Iterable[FrozenTrial], kind: str) -> float | None:
@@ -77,14 +80,16 @@ def seconds_of(trials: Iterable[FrozenTrial], kind: str) -> float | None:
     return None if None in times else sum(times)
 
 
-def params_of(run: Run) -> dict[str, Any]:
+def params_of(run: Run, distributions: Mapping[str, BaseDistribution]) -> dict[str, Any]:
     """
     Return Optuna's parameters of a run.
 
     :param run: the run
-    :return: method, task, the values of the axes, and seed
+    :param distributions: the distributions of the study's parameters
+    :return: method, task and the values of the axes; in a study of an earlier version, the seed, too
     """
-    return {"method": run.method, "task": run.task, **run.settings, "seed": run.seed}
+    seed = {SEED: run.seed} if isinstance(distributions.get(SEED), IntDistribution) else {}
+    return {"method": run.method, "task": run.task, **run.settings, **seed}
 
 
 def distributions_of(sweep: Sweep) -> dict[str, BaseDistribution]:
@@ -92,14 +97,21 @@ def distributions_of(sweep: Sweep) -> dict[str, BaseDistribution]:
     Return Optuna's distributions of the parameters of a sweep's runs.
 
     :param sweep: the sweep
-    :return: distribution by parameter; those of the file, as a later command may add methods, and any seed
+    :return: distribution by parameter; those of the file, as a later command may add methods
     """
     choices: dict[str, list[Any]] = {"method": list(sweep.file.methods), "task": sweep.file.tasks}
     choices |= {name: list(axis.values) for name, axis in sweep.file.axes.items()}
-    return {
-        **{name: CategoricalDistribution(values) for name, values in choices.items()},
-        "seed": IntDistribution(0, 2**32 - 1),
-    }
+    return {name: CategoricalDistribution(values) for name, values in choices.items()}
+
+
+def with_seed(distributions: Mapping[str, BaseDistribution]) -> dict[str, BaseDistribution]:
+    """
+    Return the distributions of a study that an earlier version began.
+
+    :param distributions: those that a study has now
+    :return: the same, and any seed
+    """
+    return {**distributions, SEED: IntDistribution(0, 2**32 - 1)}
 
 
 def choices_of(trials: Sequence[FrozenTrial], name: str) -> list[Any]:
