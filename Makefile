@@ -52,6 +52,7 @@ train: $(INSTALLED) ## install, train with rl_zoo3, evaluate and draw the learni
 	(set -x; exec $(IN_VENV) -m rl_zoo3.train --algo $(ALGO) --env $(ENV) --seed $(SEED) --num-threads $(THREADS) \
 	  $(if $(STEPS),--n-timesteps $(STEPS)) \
 	  --eval-freq $(or $(EVAL_FREQ),$$1) --eval-episodes $(EVAL_EPISODES) --log-folder "$(LOGS)" --progress \
+	  --tensorboard-log "$(LOGS)/tensorboard" \
 	  $(if $(PARAMS),-params $$3 $(PARAMS),$${3:+-params $$3}) $(ARGS)) && \
 	if test -n "$$interrupted"; then \
 	  $(if $(filter cgp,$(ALGO)),echo "or  make resume RUN=\"$(LOGS)/$(ALGO)/$(subst /,-,$(ENV))_$$2\"";) exit 130; fi && \

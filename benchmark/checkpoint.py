@@ -21,7 +21,12 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     :param argv: the arguments
     :return: the parsed arguments
     """
-    parser = measuring_parser("checkpoint", "Measure the time that it takes to save and to load a training state.")
+    parser = measuring_parser(
+        "checkpoint",
+        "Measure the time that it takes to save and to load a training state.",
+        example="--transitions 10000 --rounds 2",
+        duration="minutes, and memory and disk for a million transitions",
+    )
     parser.add_argument(
         "--env", type=continuous_environment, default="HalfCheetah-v5", help="the environment (default: %(default)s)"
     )

@@ -1,7 +1,7 @@
 """
 Draw the figures of sweeps, and write the page on their results.
 
-``python -m benchmark.figures benchmark/results/sweeps/e3 …`` takes the folders of studies, or names of studies in a storage,
+``python -m benchmark.figures results/sweeps/e3 …`` takes the folders of studies, or names of studies in a storage,
 and writes ``results.md`` and ``figures/`` into the folder of the results.
 """
 
@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmark.common.arguments import count, output_folder
+from benchmark.common.arguments import add_epilog, count, output_folder
 from benchmark.reporting.estimates import REPETITIONS
 from benchmark.reporting.figures import FIGURES, FIGURES_ONLY, FOLDER, figures, study_folders
 
@@ -33,6 +33,16 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--repetitions", type=count, default=REPETITIONS, help="number of bootstrap samples (default: %(default)s)"
     )
     parser.add_argument(FIGURES_ONLY, action="store_true", help="draw the figures, and leave the page as it is")
+    add_epilog(
+        parser,
+        "examples:\n"
+        "  python -m benchmark.figures\n"
+        "  python -m benchmark.figures results/sweeps/e3-Pendulum-v1\n"
+        "  python -m benchmark.figures --folder benchmark/results/sweeps\n"
+        "  python -m benchmark.figures e3-Pendulum-v1 --storage sqlite:///logs/sweeps/studies.db",
+        "It takes seconds to minutes. results.md and figures/ are written to --folder; the third example is for this\n"
+        "repository's own results.",
+    )
     args = parser.parse_args(argv)
     # A shell's * names the folder of the figures, too
     named = [study for study in args.studies if Path(study) != args.folder / FIGURES]

@@ -21,7 +21,12 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     :param argv: the arguments
     :return: the parsed arguments
     """
-    parser = measuring_parser("latency", "Measure the time per action of a policy and of its exports.")
+    parser = measuring_parser(
+        "latency",
+        "Measure the time per action of a policy and of its exports.",
+        example="--rounds 10",
+        duration="about a minute",
+    )
     parser.add_argument(
         "--env", type=continuous_environment, default="HalfCheetah-v5", help="the environment (default: %(default)s)"
     )

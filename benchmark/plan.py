@@ -15,7 +15,7 @@ import gymnasium as gym
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import ALGOS, get_latest_run_id
 
-from benchmark.common.arguments import count
+from benchmark.common.arguments import add_epilog, count
 from benchmark.common.environments import import_packages, split_env_id
 from benchmark.common.zoo import read_entry, shortened_warm_up, warm_up_in_words
 
@@ -121,6 +121,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--steps", type=count, help="length of the run (default: that of the YAML file)")
     parser.add_argument("--gym-packages", nargs="+", default=[], help="modules to import, which register environments")
     parser.add_argument("options", nargs="*", metavar="-- OPTION", help="other options of rl_zoo3.train")
+    add_epilog(
+        parser,
+        "example:\n  python -m benchmark.plan --algo cgp --env Pendulum-v1 --steps 5000 -- -params batch_size:64",
+        "It prints a line, and writes nothing.",
+    )
     args = parser.parse_args(argv)
     options = train_options(args.options)
     # rl_zoo3 takes a negative number for the YAML file's

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from rl_zoo3 import ALGOS
 
+from benchmark.common.arguments import add_epilog
 from benchmark.common.environments import import_packages, split_env_id
 from benchmark.common.records import EVALUATION_SEED
 from benchmark.reporting.run_reports import report, summary
@@ -33,6 +34,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--episodes", default=20, type=int, help="episodes of the final evaluation (default: %(default)s)")
     parser.add_argument(
         "--seed", default=EVALUATION_SEED, type=int, help="seed of the final evaluation (default: %(default)s)"
+    )
+    add_epilog(
+        parser,
+        "examples:\n"
+        "  python -m benchmark.report --algo cgp --env Pendulum-v1\n"
+        "  python -m benchmark.report --run logs/cgp/Pendulum-v1_1 --episodes 100",
+        "It takes the time of the episodes, seconds to a minute. learning_curve.png and report.json are written to the\n"
+        "run's folder.",
     )
     args = parser.parse_args(argv)
     try:

@@ -23,7 +23,12 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     :param argv: the arguments
     :return: the parsed arguments
     """
-    parser = measuring_parser("scaling", "Measure how the cost of training grows.")
+    parser = measuring_parser(
+        "scaling",
+        "Measure how the cost of training grows.",
+        example="--rounds 2 --axes cem_samples",
+        duration="up to a quarter of an hour",
+    )
     parser.add_argument("--rounds", type=count, default=10, help="timed runs of each setting (default: %(default)s)")
     # An even number, as TD3 updates its actor in every second one
     parser.add_argument("--gradient-steps", type=count, default=10, help="gradient steps per run (default: %(default)s)")

@@ -22,7 +22,12 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     :param argv: the arguments
     :return: the parsed arguments
     """
-    parser = measuring_parser("selector", "Measure one CEM call across its sizes and data types.")
+    parser = measuring_parser(
+        "selector",
+        "Measure one CEM call across its sizes and data types.",
+        example="--rounds 5 --vary",
+        duration="up to a quarter of an hour",
+    )
     parser.add_argument("--rounds", type=count, default=20, help="timed calls of each kind (default: %(default)s)")
     parser.add_argument(
         "--dtypes", nargs="+", choices=list(DTYPES), default=list(DTYPES), help="hidden layers' data types (default: both)"

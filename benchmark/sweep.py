@@ -10,14 +10,27 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from benchmark.common.arguments import count, hyperparameter, output_folder
-from benchmark.reporting.figures import figures, study_folders
+from benchmark.common.arguments import add_epilog, count, hyperparameter, output_folder
+from benchmark.reporting.figures import FOLDER, figures, study_folders
 from benchmark.sweeps.checks import check_values
 from benchmark.sweeps.execution import execute
-from benchmark.sweeps.experiments import Sweep, included_sweeps, load_sweep, study_name
+from benchmark.sweeps.experiments import Sweep, experiments_in_words, included_sweeps, load_sweep, study_name
 from benchmark.sweeps.processes import add_workers, check_grace, share_of_cores, terminate
 from benchmark.sweeps.storages import STORAGE_ERRORS, open_storage, reason_of
 from benchmark.sweeps.validation import SweepError
+
+EXAMPLES = """\
+examples:
+  python -m benchmark.sweep e3 --task Pendulum-v1 --steps 3000 --seeds 2 --workers 2
+  python -m benchmark.sweep e4 --task Pendulum-v1 --steps 3000 --seeds 1 --set "policy_kwargs=dict(net_arch=[64, 64])"
+  python -m benchmark.sweep mine.yml --workers 2"""
+DURATION = """\
+The first example takes an hour on two cores. With a million steps on HalfCheetah-v5, a run of CGP takes seven hours on a core
+of an AMD EPYC, and one of TD3 an hour and a half; e1 is 200 runs. --steps shortens runs; at most a tenth of a shortened run
+is random, unless --set learning_starts=... sets the number. After an interruption, the same command continues."""
+RESULTS = """\
+The page results.md, the figures and the runs as text (STUDY/runs.jsonl) are written to --results, trained models and states to
+--logs, and the study to --storage. This repository's own results are in benchmark/results/sweeps: see docs/experiments.md."""
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -52,12 +65,13 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--results",
         type=output_folder,
-        default="benchmark/results/sweeps",
+        default=FOLDER,
         help="folder of the results (default: %(default)s)",
     )
     parser.add_argument(
         "--adopt", action="store_true", help="take the ended runs that the folder of the results holds, trained elsewhere"
     )
+    add_epilog(parser, EXAMPLES, experiments_in_words(), DURATION, RESULTS)
     args = parser.parse_args(argv)
     args.threads = args.threads or share_of_cores(args.workers)
     return args

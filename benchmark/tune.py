@@ -15,7 +15,7 @@ import optuna
 import torch as th
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
-from benchmark.common.arguments import count, hyperparameter
+from benchmark.common.arguments import add_epilog, count, hyperparameter
 from benchmark.common.environments import import_packages, registered_environment, split_env_id
 from benchmark.common.zoo import shortened_warm_up, warm_up_in_words
 from benchmark.sweeps.checks import check_tuning
@@ -29,6 +29,18 @@ from benchmark.sweeps.tune_execution import execute_trials, tune
 from benchmark.sweeps.tuner import Tuner
 from benchmark.sweeps.tuning import SCORES, Tuning
 from sb3_cgp.zoo.registration import register
+
+EXAMPLES = """\
+examples:
+  python -m benchmark.tune --algo cgp --env Pendulum-v1 --steps 5000 --seeds 2 --trials 10 --workers 2 --write mine.yml
+  python -m rl_zoo3.train --algo cgp --env Pendulum-v1 --conf-file mine.yml"""
+DURATION = """\
+It takes at most the time of --seeds times --trials runs, divided by --workers: the example up to 20 runs of 5,000 steps, of
+one to a few minutes each. At most a tenth of a shortened run is random, unless --set learning_starts=... sets the number.
+After an interruption, the same command continues."""
+RESULTS = """\
+The best configuration is printed, and written to the file of --write. Runs lie in --logs, and the study in --storage, for
+optuna-dashboard."""
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -68,6 +80,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--study", help="the study's name (default: tune, the algorithm and the environment)")
     add_workers(parser, "logs/tuning")
     parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)
+    add_epilog(parser, EXAMPLES, DURATION, RESULTS)
     args = parser.parse_args(argv)
     args.threads = args.threads or share_of_cores(args.workers)
     return args

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch as th
 
-from benchmark.common.arguments import count
+from benchmark.common.arguments import add_epilog, count
 from benchmark.sweeps.processes import add_heartbeats, check_grace, install_signal_handlers
 from benchmark.sweeps.storages import open_storage, patiently
 from benchmark.sweeps.studies import Ledger
@@ -35,6 +35,12 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--device", default="auto", help="device of the networks (default: %(default)s)")
     add_heartbeats(parser)
     parser.add_argument("--parent", type=int, help="the process whose end is this one's, too")
+    add_epilog(
+        parser,
+        "example, for a study that benchmark.sweep has begun:\n"
+        "  python -m benchmark.worker --study e3-Pendulum-v1 --storage sqlite:///logs/sweeps/studies.db --logs logs/sweeps",
+        "The process ends when no run is left. Its runs lie in --logs; benchmark.sweep, given again, writes the page on them.",
+    )
     return parser.parse_args(argv)
 
 

@@ -88,6 +88,13 @@ def test_the_advice_on_extras_needs_no_package_index_that_has_sb3_cgp():
     assert "-c constraints.txt" in advice
 
 
+def test_the_page_on_troubles_gives_the_same_advice_and_is_linked():
+    page = (ROOT / "docs" / "troubleshooting.md").read_text()
+    for command in re.findall(r"pip install [^;]*", how_to_install("export")):
+        assert command in page
+    assert "(docs/troubleshooting.md)" in (ROOT / "README.md").read_text()
+
+
 COMMANDS = sorted(path.stem for path in (ROOT / "benchmark").glob("*.py") if path.stem != "__init__")
 SWEEPS, EXPORT = ("sweep", "tune", "worker"), ("latency",)
 
@@ -116,6 +123,27 @@ for command in {COMMANDS}:
     assert sorted(messages) == sorted(refused)
     expected = f"needs {missing}, which is not installed. It is in the extra `{extra}`: {how_to_install(extra)}"
     assert all(message.endswith(expected) for message in messages.values())
+
+
+def test_every_command_of_benchmark_helps_with_an_example_its_duration_and_the_place_of_its_results():
+    helps = python(f"""
+import contextlib, importlib, io, sys
+for command in {COMMANDS}:
+    module = importlib.import_module(f"benchmark.{{command}}")
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        module.main(["--help"])
+    print(printed.getvalue(), end="----")
+""").split("----")
+    for command, text in zip(COMMANDS, helps[:-1], strict=True):
+        epilog = text[re.search(r"^examples?[:,]", text, re.MULTILINE).start() :]
+        assert f"  python -m benchmark.{command}" in epilog
+        assert re.search(r"[Ii]t takes|takes an hour|ends when no run is left|writes nothing", epilog), command
+        assert re.search(r"written to|--logs|writes nothing", epilog), command
+        assert max(map(len, epilog.splitlines())) <= 132
+    sweep = helps[COMMANDS.index("sweep")]
+    names = [line.split()[0] for line in sweep.partition("sweeps:\n")[2].splitlines()[:9]]
+    assert names == [f"e{number}" for number in (*range(1, 9), 10)]
 
 
 def test_a_database_whose_driver_is_missing_names_the_extra(monkeypatch):

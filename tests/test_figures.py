@@ -142,7 +142,7 @@ def test_page_repeats(folder: Path, tmp_path: Path) -> None:
 
 def test_page_names_sweeps_runs_and_failures(folder: Path) -> None:
     text = unpadded((folder / "results.md").read_text())
-    assert f"`python -m {SWEEP} axis`" in text
+    assert f"`python -m {SWEEP} axis --results {folder}`" in text
     assert "24 of 30 planned runs have ended, 1 of them failed. **The rest is missing" in text
     assert "- TD3: `ValueError: NaN` (1 run)" in text
     assert "counts with the lowest return that any evaluation" in text
@@ -287,10 +287,46 @@ def test_named_study_is_taken_from_its_storage(folder: Path, tmp_path: Path, mon
         main(["yours", *options])
 
 
+@pytest.mark.parametrize(
+    ("experiment", "first"),
+    [
+        ("e3", "## The paper's claims"),
+        ("e8", "## The paper's claims"),
+        ("mine", "## The study mine"),
+        ("e10", "## The study e10"),
+    ],
+)
+def test_page_begins_with_the_findings(experiment: str, first: str, tmp_path: Path) -> None:
+    """Those of a user's own sweep come before the paper's claims; how to read them comes last."""
+    study = write_study(tmp_path / experiment, runs(score, BASELINES[:2], GRID[:2]))
+    headings = [line for line in figures([study], tmp_path, 20).read_text().splitlines() if line.startswith(("# ", "## "))]
+    assert headings[:2] == ["# Results of sweeps", first]
+    assert headings[-1] == "## How to read this page"
+    assert len([line for line in headings if line == "## The paper's claims"]) == 1
+
+
+def test_printed_sweep_commands_name_a_folder_that_is_not_the_default(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    for out, option in (
+        ("tracked/my sweeps", " --results 'tracked/my sweeps'`"),
+        (command.FOLDER.as_posix(), "benchmark.sweep mine`"),
+    ):
+        study = write_study(make(tmp_path / out / "mine"), runs(score, BASELINES[:1]))
+        text = figures([study], tmp_path / out, 20).read_text()
+        (line,) = [line for line in text.splitlines() if line.startswith("The runs: ")]
+        assert option in line
+        assert ("--results" in line) == ("--results" in option)
+
+
+def make(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    return folder
+
+
 def test_default_folder_is_left_out_of_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     line = command.command_line([command.FOLDER / "e3"], tmp_path / command.FOLDER, command.REPETITIONS)
-    assert line == "python -m benchmark.figures benchmark/results/sweeps/e3"
+    assert line == "python -m benchmark.figures results/sweeps/e3"
 
 
 def test_runs_at_numbers_that_are_none(tmp_path: Path) -> None:

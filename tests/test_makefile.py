@@ -91,7 +91,7 @@ def test_train_from_a_fresh_clone(clone: Clone) -> None:
         "-m pip install -c constraints.txt -e .[zoo]",
         "-m benchmark.plan --algo cgp --env Pendulum-v1 --folder logs",
         "-m rl_zoo3.train --algo cgp --env Pendulum-v1 --seed 0 --num-threads 1 --eval-freq 250 --eval-episodes 10 "
-        "--log-folder logs --progress",
+        "--log-folder logs --progress --tensorboard-log logs/tensorboard",
         "-m benchmark.report --algo cgp --env Pendulum-v1 --folder logs --exp-id 4",
     ]
 
@@ -107,7 +107,8 @@ def test_train_takes_the_settings_of_a_run(clone: Clone) -> None:
     ]
     assert starting(calls, "-m rl_zoo3.train") == [
         "-m rl_zoo3.train --algo td3 --env Ant-v5 --seed 2 --num-threads 4 --n-timesteps 60000 --eval-freq 500 "
-        "--eval-episodes 10 --log-folder <my logs> --progress -params batch_size:128 policy_loss:'qgp' --save-freq 100"
+        "--eval-episodes 10 --log-folder <my logs> --progress --tensorboard-log <my logs/tensorboard> "
+        "-params batch_size:128 policy_loss:'qgp' --save-freq 100"
     ]
 
 
@@ -117,7 +118,7 @@ def test_train_takes_the_settings_of_a_run(clone: Clone) -> None:
 def test_the_planned_warm_up_is_a_hyperparameter_of_the_run(params: str, expected: str, clone: Clone) -> None:
     calls, ended = clone.make("train", "STEPS=250", f"PARAMS={params}", "ARGS=--uuid", WARM_UP="learning_starts:25")
     assert ended.returncode == 0, ended.stderr
-    assert starting(calls, "-m rl_zoo3.train")[0].endswith(f"--progress -params {expected} --uuid")
+    assert starting(calls, "-m rl_zoo3.train")[0].endswith(f"--tensorboard-log logs/tensorboard -params {expected} --uuid")
 
 
 def test_settings_are_not_taken_from_the_environment(clone: Clone) -> None:

@@ -99,3 +99,15 @@ def output_folder(text: str) -> Path:
     except OSError as error:
         raise argparse.ArgumentTypeError(f"{text!r} cannot be made: {error.strerror}") from error
     return folder
+
+
+def add_epilog(parser: argparse.ArgumentParser, *paragraphs: str) -> None:
+    """
+    Let a command's help end with examples, its duration and the place of its results, with their line breaks.
+
+    :param parser: the command's parser
+    :param paragraphs: the paragraphs
+    """
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    # argparse formats the text of an epilog, and only %(prog)s is defined in it
+    parser.epilog = "\n\n".join(paragraphs).replace("%", "%%")

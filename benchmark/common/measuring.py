@@ -7,18 +7,22 @@ from typing import Any
 
 import torch as th
 
-from benchmark.common.arguments import count, device, output_folder
+from benchmark.common.arguments import add_epilog, count, device, output_folder
 from benchmark.common.files import publish
 from benchmark.common.provenance import conditions
 
 
-def measuring_parser(name: str, description: str, with_seed: bool = True) -> argparse.ArgumentParser:
+def measuring_parser(
+    name: str, description: str, with_seed: bool = True, example: str = "", duration: str = ""
+) -> argparse.ArgumentParser:
     """
     Return the parser of a command that measures.
 
     :param name: the command's module within ``benchmark``
     :param description: the command's description
     :param with_seed: whether the command takes one seed; False for a command that takes several
+    :param example: options of an example, a shorter measurement
+    :param duration: the time that the command takes without options, as text
     :return: the parser, with the arguments of all such commands
     """
     parser = argparse.ArgumentParser(prog=f"python -m benchmark.{name}", description=description)
@@ -30,7 +34,14 @@ def measuring_parser(name: str, description: str, with_seed: bool = True) -> arg
     add("--device", device, "auto", "device of the networks")
     if with_seed:
         add("--seed", int, 0, "seed of the random numbers")
-    add("--folder", output_folder, f"benchmark/results/{name}", "folder of the results")
+    add("--folder", output_folder, f"results/{name}", "folder of the results")
+    examples = [name, *([f"{name} {example}"] if example else [])]
+    add_epilog(
+        parser,
+        "examples:\n" + "\n".join(f"  python -m benchmark.{command}" for command in examples),
+        *([f"It takes {duration}."] if duration else []),
+        f"The table or picture and its data are written to --folder. This repository's own are in benchmark/results/{name}.",
+    )
     return parser
 
 

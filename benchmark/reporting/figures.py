@@ -1,5 +1,6 @@
 """The figures of studies, which follow from their runs, and the page that shows them with the commands that draw them."""
 
+import dataclasses
 import itertools
 import json
 import re
@@ -22,7 +23,8 @@ from benchmark.reporting.page import Picture, claims_section, page, pooled_secti
 from benchmark.reporting.scores import Study, axis_in_words, longest, read_study, score_table
 from sb3_cgp.common.files import write_atomically
 
-FOLDER = Path("benchmark/results/sweeps")
+# Not tracked by git, unlike this repository's own results in benchmark/results/sweeps
+FOLDER = Path("results/sweeps")
 RUNTIME = Path(__file__).parent.parent / "results/runtime/runtime.json"
 PAGE = "results.md"
 FIGURES = "figures"
@@ -75,17 +77,62 @@ def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPE
         write_atomically(out / picture.path, picture.content)
     if with_page:
         papers = [study for study in in_earnest if study.facts["experiment"] not in NOT_THE_PAPERS]
-        found = findings(score_table(papers), read_runtime(), repetitions)
+        found = findings(score_table(papers), read_runtime(out), repetitions)
         command = command_line(folders, out, repetitions)
-        answers = [light_section(studies), experiments_section(in_earnest, repetitions)]
-        sections = [f"`{command}` writes this page.", claims_section(found), *filter(None, answers)]
-        sections += [pooled_section(picture, f"{command} {FIGURES_ONLY}") for picture in together]
+        answers = list(filter(None, [light_section(studies), experiments_section(in_earnest, repetitions)]))
+        claims = claims_section(found)
+        pooled = [pooled_section(picture, f"{command} {FIGURES_ONLY}") for picture in together]
+        results = []
         for study, own in zip(studies, pictures, strict=True):
             # A study's figures depend on nothing else
-            command = f"{command_line([study.folder], out, repetitions)} {FIGURES_ONLY}"
-            sections.append(study_section(study, own, command, repetitions))
+            drawing = f"{command_line([study.folder], out, repetitions)} {FIGURES_ONLY}"
+            results.append(study_section(with_results_folder(study, out), own, drawing, repetitions))
+        if any(is_papers(study) for study in studies):
+            sections = [claims, *answers, *pooled, *results]
+        else:
+            # The user's findings come first, and the paper's claims last
+            sections = [*answers, *results, claims, *pooled]
+        sections.append(f"`{command}` writes this page.")
         write_atomically(out / PAGE, page(sections).encode())
     return out / PAGE
+
+
+def is_papers(study: Study) -> bool:
+    """
+    Return whether a study is one of the paper's experiments.
+
+    :param study: the study
+    :return: whether it is of E1 to E8, whatever its tasks and lengths
+    """
+    return re.fullmatch(r"e\d+", study.facts["experiment"]) is not None and study.facts["experiment"] not in NOT_THE_PAPERS
+
+
+def with_results_folder(study: Study, out: Path) -> Study:
+    """
+    Return a study whose commands name the folder of the results, which their records leave out as private.
+
+    :param study: the study
+    :param out: the folder of the page and the figures
+    :return: the study; unchanged where the folder is the default of ``benchmark.sweep``
+    """
+    if shown(out) == FOLDER.as_posix():
+        return study
+    commands = [
+        {**command, "command": f"{command['command']} {shlex.join(['--results', shown(out)])}"}
+        for command in study.facts["commands"]
+    ]
+    return dataclasses.replace(study, facts={**study.facts, "commands": commands})
+
+
+def shown(path: Path) -> str:
+    """
+    Return a path as commands name it.
+
+    :param path: the path
+    :return: the path from the present folder, if it is in there
+    """
+    here = Path.cwd()
+    return (path.resolve().relative_to(here) if path.resolve().is_relative_to(here) else path).as_posix()
 
 
 def command_line(folders: Sequence[Path], out: Path, repetitions: int) -> str:
@@ -97,11 +144,6 @@ def command_line(folders: Sequence[Path], out: Path, repetitions: int) -> str:
     :param repetitions: number of bootstrap samples
     :return: the command
     """
-
-    def shown(path: Path) -> str:
-        here = Path.cwd()
-        return (path.resolve().relative_to(here) if path.resolve().is_relative_to(here) else path).as_posix()
-
     arguments = [shown(folder) for folder in folders]
     if shown(out) != FOLDER.as_posix():
         arguments += ["--folder", shown(out)]
@@ -110,13 +152,15 @@ def command_line(folders: Sequence[Path], out: Path, repetitions: int) -> str:
     return shlex.join(["python", "-m", "benchmark.figures", *arguments])
 
 
-def read_runtime() -> dict[str, Any] | None:
+def read_runtime(out: Path) -> dict[str, Any] | None:
     """
     Read the record of ``benchmark.runtime``.
 
-    :return: its record; None without one
+    :param out: the folder of the page
+    :return: the record in the folder beside it, or this repository's; None without one
     """
-    return json.loads(RUNTIME.read_text()) if RUNTIME.is_file() else None
+    own = out.parent / "runtime/runtime.json"
+    return next((json.loads(path.read_text()) for path in (own, RUNTIME) if path.is_file()), None)
 
 
 def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:

@@ -24,8 +24,9 @@ from benchmark.reporting.literature import literature_section
 from benchmark.reporting.scores import FAILURE_RULE, LENGTH_RULE, Study, failed, score_table
 from benchmark.reporting.verdicts import OURS, Finding
 
-INTRODUCTION = f"""\
-# Results of sweeps
+TITLE = "# Results of sweeps"
+READING = f"""\
+## How to read this page
 
 A run's score is the mean return of its final model over {FINAL_EPISODES} episodes, which are the same for all runs on a task.
 The intervals do not contain the variance of the mean over other episodes, so small differences may be due to these episodes.
@@ -215,4 +216,4 @@ def page(sections: Sequence[str]) -> str:
     :param sections: its sections
     :return: the page, in Markdown
     """
-    return "\n\n".join([INTRODUCTION, *sections]) + "\n"
+    return "\n\n".join([TITLE, *sections, READING]) + "\n"

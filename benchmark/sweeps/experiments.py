@@ -136,6 +136,26 @@ def _with_numbers(name: str) -> list[str | int]:
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
 
 
+def experiments_in_words() -> str:
+    """
+    Return a list of the sweeps that have names.
+
+    :return: name and title of each, a line each
+    """
+
+    def order(path: Path) -> tuple[int, str]:
+        number = re.match(r"e(\d+)", path.stem)
+        return (int(number[1]) if number else 1_000, path.stem)
+
+    paths = sorted((path for path in sweeps_folder().glob("*.yml") if path.name != METHODS_FILE), key=order)
+    lines = []
+    for path in paths:
+        content = read_yaml(path)
+        parts = f" = {', '.join(content['includes'])}" if "includes" in content else f", {content['steps']:,} steps"
+        lines.append(f"  {path.stem:<14} {content['title']}{parts}")
+    return "\n".join(["sweeps:", *lines])
+
+
 def included_sweeps(name: str) -> list[str]:
     """
     Return the sweeps that a name stands for.
