@@ -11,20 +11,23 @@ import pytest
 import torch as th
 from environments import Doubles
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from test_cuda_graphs import StandIn
 from torch import nn
 
 from sb3_cgp import CEM, CGP, CGPPolicy, TrainingCheckpointCallback
 from sb3_cgp.fast import cuda_graphs
+from sb3_cgp.fast.device_replay import DeviceReplayBuffer
 from sb3_cgp.population import Population, PopulationEvalCallback, evaluate_population, training
 from sb3_cgp.population.adam import AgentAdam
-from sb3_cgp.population.replay import sample_columns
+from sb3_cgp.population.replay import copied_column, sample_columns
 from sb3_cgp.selectors import MPPI, ActorCEM, ActorOnly, ActorStart
 
 SMALL = dict(
@@ -268,7 +271,7 @@ def test_adam_is_pytorchs_for_each_agent_that_is_due(dtype):
     for step in range(1, 301):
         due = th.tensor([True, step % 3 == 0, step > 50])
         gradients = [th.randn(shape, dtype=dtype) * 10 ** th.randn(()) for shape in shapes]
-        # Who is not due may have any gradient
+        # Agents that are not due may have any gradient
         given = [th.where(due.view(3, 1, 1), gradient, math.nan) for gradient in gradients]
         optimizer.step(parameters, given, due.view(3, 1, 1))
         for agent in range(3):
@@ -332,6 +335,26 @@ def test_each_agent_samples_its_own_column(n_steps):
             assert done == (agent == 0 and (row + length) % 7 == 0)
             assert reward.item() == pytest.approx((agent + 1) * sum(gamma**k for k in range(length)), rel=1e-5)
             assert discount.item() == pytest.approx(gamma**length, rel=1e-5)
+
+
+def test_a_buffer_on_the_networks_device_gives_the_same_samples_and_columns():
+    population = make(3).learn(3 * 40)
+    host = population.replay_buffer
+    device = DeviceReplayBuffer(3 * 500, Doubles.observation_space, Doubles.action_space, device="cpu", n_envs=3)
+    for name in device.row_fields:
+        getattr(device, name)[:] = th.as_tensor(getattr(host, name))
+    device.pos = host.pos
+    set_random_seed(1)
+    expected = sample_columns(host, 30, population._numbers.gammas)
+    set_random_seed(1)
+    for field, value in zip(sample_columns(device, 30, population._numbers.gammas), expected, strict=True):
+        assert th.equal(field.float(), value.float())
+    own = copied_column(device, 2)
+    assert (type(own), own.n_envs, own.size()) == (DeviceReplayBuffer, 1, 40)
+    assert th.equal(own.actions[:40, 0], th.as_tensor(host.actions[:40, 2]))
+    own.actions[:] = 7
+    assert not (device.actions == 7).any()
+    assert own.sample(5).actions.shape == (5, 2)
 
 
 # --- Failures ---
@@ -588,6 +611,34 @@ def test_all_agents_are_evaluated_at_once(tmp_path):
         alone, _ = evaluate_policy(population[index], env, n_eval_episodes=1)
         assert returns[index, 0] == pytest.approx(alone, rel=1e-3)
     assert returns[0, 0] != returns[1, 0]
+
+
+def test_sb3s_callbacks_and_log_take_a_population(tmp_path):
+    evaluation = EvalCallback(make_env(2), eval_freq=10, n_eval_episodes=4, verbose=0, warn=False)
+    checkpoints = CheckpointCallback(20, tmp_path)
+    population, log = make(2), Log()
+    population.set_logger(Logger(None, [log]))
+    population.learn(2 * 45, callback=[evaluation, checkpoints], log_interval=2)
+    assert np.isfinite(evaluation.last_mean_reward)
+    assert len(Population.load(tmp_path / "rl_model_80_steps")) == 2
+    logged = {name: value for row in log.rows for name, value in row.items()}
+    for name in ("critic_loss", "actor_loss", "q_value", "learning_rate", "failed_agents"):
+        assert math.isfinite(logged[f"train/{name}"])
+    assert logged["train/n_updates"] == 24
+    assert logged["eval/mean_reward"] == evaluation.last_mean_reward
+
+
+class Log(KVWriter):
+    """Keeps what is logged."""
+
+    def __init__(self):
+        self.rows = []
+
+    def write(self, key_values, key_excluded, step=0):
+        self.rows.append({**key_values, "step": step})
+
+    def close(self):
+        pass
 
 
 # --- CUDA graphs ---

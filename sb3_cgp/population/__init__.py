@@ -1,10 +1,11 @@
 """
 Many CGP agents in one process.
 
-A :class:`Population` trains N agents in lockstep: they share the program and its order, and nothing else.
+A :class:`Population` trains N agents in lockstep: the operations of a step are those of one agent, on tensors with an axis of
+agents, so that N agents share what it costs to start them.
 
 ==========================  ==================================================================================================
-part                        how N agents share it
+part                        how it is made for N agents
 ==========================  ==================================================================================================
 environments                one ``VecEnv`` of N environments; environment i belongs to agent i
 replay buffer               one of SB3's, of N environments; agent i samples column i (``replay.py``)
