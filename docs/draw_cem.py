@@ -39,14 +39,11 @@ def train(steps: int, seed: int) -> CGP:
     return model.learn(steps)
 
 
-def reached_state(model: CGP, steps: int, seed: int) -> th.Tensor:
-    """Return the observation after some steps of the actor from a start with this seed, shape (1, observation size)."""
+def first_state(model: CGP, seed: int) -> th.Tensor:
+    """Return the first observation of the episode with this seed, shape (1, observation size)."""
     env = model.get_env()
     env.seed(seed)
-    observation = env.reset()
-    for _ in range(steps):
-        observation, *_ = env.step(model.predict(observation)[0])
-    return th.as_tensor(observation, dtype=th.float32)
+    return th.as_tensor(env.reset(), dtype=th.float32)
 
 
 class Search:
@@ -136,5 +133,5 @@ if __name__ == "__main__":
     th.set_num_threads(1)
     model = train(arguments.steps, arguments.seed)
     th.manual_seed(arguments.seed)
-    write_gif(Search(model, reached_state(model, 3, arguments.seed)), arguments.path)
+    write_gif(Search(model, first_state(model, arguments.seed)), arguments.path)
     print(f"Wrote {arguments.path}")

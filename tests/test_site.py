@@ -6,6 +6,10 @@ import runpy
 import pytest
 from examples import ROOT, python_examples, run_in_order
 
+import sb3_cgp.resumption
+import sb3_cgp.selectors
+import sb3_cgp.zoo
+
 # Those whose examples have tests of their own, or belong to the clone
 ELSEWHERE = {"docs/architecture.md", "docs/experiments.md", "docs/trust.md"}
 PAGES = sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))
@@ -34,6 +38,14 @@ def test_figures_on_hyperparameters_are_those_of_the_sweeps():
     recorded = {(row[1], row[3], row[5]) for row in recorded if len(row) == 9}
     assert len(rows) == 24
     assert [row for row in rows if tuple(row) not in recorded] == []
+
+
+def test_every_public_name_is_documented_once():
+    reference = "".join((ROOT / "docs" / page).read_text() for page in ("algorithm.md", "api.md"))
+    documented = [name.rpartition(".")[2] for name in re.findall(r"\.\. auto(?:class|function|exception):: (\S+)", reference)]
+    modules = (sb3_cgp, sb3_cgp.resumption, sb3_cgp.selectors, sb3_cgp.zoo)
+    public = {name for module in modules for name in module.__all__} - {"__version__"}
+    assert sorted(documented) == sorted(public)
 
 
 CHECK = runpy.run_path(str(ROOT / "docs" / "check_site.py"))["find_faults"]
