@@ -5,12 +5,15 @@ from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
 from sb3_cgp.resumption.declarations import register_restorable
 from sb3_cgp.resumption.environments import RestorableEnv
 from sb3_cgp.resumption.locks import FolderInUseError
+from sb3_cgp.resumption.replayed import ReplayedEnv, replayed
 
 __all__ = [
     "FolderInUseError",
+    "ReplayedEnv",
     "RestorableEnv",
     "ResumableAlgorithm",
     "TrainingCheckpointCallback",
     "register_restorable",
+    "replayed",
     "resumable",
 ]

@@ -9,6 +9,7 @@ These environments and wrappers can be restored:
   :class:`RestorableEnv`,
 - environments that derive from Gymnasium's ``MujocoEnv`` or Gymnasium-Robotics' ``MujocoRobotEnv`` and whose attributes are
   plain data, and tasks of dm_control's suite in shimmy's ``DmControlCompatibilityV0``,
+- deterministic environments within :class:`~sb3_cgp.resumption.replayed.ReplayedEnv`, such as Gymnasium's Box2D tasks,
 - those of a class that :func:`~sb3_cgp.resumption.declarations.register_restorable` was given,
 - any other environment, wrapper or vectorised environment whose class has two methods:
   ``get_training_state()`` returns the object's state as plain data (see :func:`~sb3_cgp.resumption.plain_data.to_plain`),
@@ -34,6 +35,7 @@ from stable_baselines3.common.vec_env.stacked_observations import StackedObserva
 from sb3_cgp.common.rules import require
 from sb3_cgp.resumption.declarations import METHODS, find_declaration, pickle_declarations, unpickle_declarations
 from sb3_cgp.resumption.layers import is_known, layer_state, set_layer_state
+from sb3_cgp.resumption.replayed import ReplayedEnv
 
 
 class RestorableEnv(gym.Wrapper):
@@ -199,7 +201,11 @@ def _chain(env: gym.Env) -> Iterator[gym.Env]:
 
 def _chain_state(env: gym.Env, problems: list[str]) -> dict[str, Any]:
     """Copy the state of an environment and its wrappers."""
-    return {"layers": [layer_state(layer, problems) for layer in _chain(env)]}
+    states, is_replayed = [], False
+    for layer in _chain(env):
+        states.append(layer_state(layer, problems, is_replayed))
+        is_replayed = isinstance(layer, ReplayedEnv)
+    return {"layers": states}
 
 
 def _set_chain_state(env: gym.Env, state: dict[str, Any]) -> None:

@@ -61,12 +61,13 @@ RANDOM_STATE = {"_np_random", "_np_random_seed"}
 CONSTANT_MODELS = "gymnasium.envs.mujoco."
 
 
-def layer_state(layer: Any, problems: list[str]) -> dict[str, Any]:
+def layer_state(layer: Any, problems: list[str], is_replayed: bool = False) -> dict[str, Any]:
     """
     Copy the state of one environment or wrapper, without the environment that it wraps.
 
     :param layer: the environment or wrapper
     :param problems: a list to which a sentence is appended for each obstacle to restoring the layer
+    :param is_replayed: whether a wrapper around the layer repeats its episode: its random generators alone are then copied
     :return: plain data, from which the layer can be restored if no sentence was appended
     :raises ValueError: if ``get_training_state()`` returns anything but plain data
     """
@@ -75,7 +76,9 @@ def layer_state(layer: Any, problems: list[str]) -> dict[str, Any]:
     state: dict[str, Any] = {"class": name}
     # Looked up in the class, as wrappers of vectorised environments forward the attributes of the wrapped one
     declaration = find_declaration(kind)
-    if declaration is not None and declaration.get is not None:
+    if is_replayed:
+        state["attributes"] = plain_attributes(layer, without=vars(layer).keys() - RANDOM_STATE)
+    elif declaration is not None and declaration.get is not None:
         state["own"] = _own_state(layer, name, declaration, problems)
         state["attributes"] = plain_attributes(layer, without=vars(layer).keys() - RANDOM_STATE)
     else:
@@ -85,7 +88,7 @@ def layer_state(layer: Any, problems: list[str]) -> dict[str, Any]:
         is_declared = declaration is not None
         problems.extend(_problems(layer, name, state["attributes"].keys(), is_declared))
     state["spaces"] = {key: _space_state(value) for key, value in vars(layer).items() if isinstance(value, spaces.Space)}
-    data = get_mujoco_data(layer)
+    data = None if is_replayed else get_mujoco_data(layer)
     if data is not None:
         if is_restorable(data):
             state["mujoco"] = mujoco_state(data)
@@ -113,7 +116,7 @@ def set_layer_state(layer: Any, state: dict[str, Any]) -> None:
     for name, space_state in state["spaces"].items():
         _set_space_state(vars(layer)[name], space_state)
     data = get_mujoco_data(layer)
-    if data is not None:
+    if data is not None and "mujoco" in state:
         set_mujoco_state(data, state["mujoco"])
         if "mujoco_model" in state:
             set_model_state(data.model, state["mujoco_model"])
