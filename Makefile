@@ -29,11 +29,12 @@ STAMP := $(VENV)/.installed-
 INSTALLED := $(STAMP)zoo
 SWEEPS_INSTALLED := $(STAMP)sweeps
 TESTS_INSTALLED := $(STAMP)tests
+DOCS_INSTALLED := $(STAMP)docs
 # An editable install holds copies of the version and of the start-up hook.
 REQUIREMENTS := setup.cfg pyproject.toml constraints.txt _build_backend.py sb3_cgp/version.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help train resume sweeps test test-slow lint format clean
+.PHONY: help train resume sweeps docs test test-slow lint format clean
 
 help: ## list the goals
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -64,6 +65,12 @@ resume: $(INSTALLED) ## continue an interrupted run of CGP to its end, and repor
 	$(IN_VENV) -m benchmark.report --run "$(RUN)"
 
 sweeps: $(SWEEPS_INSTALLED) ## install the requirements of benchmark.sweep and benchmark.tune
+
+docs: $(DOCS_INSTALLED) ## install, build the documentation site into build/site, and check its links
+	rm -rf build/site
+	$(IN_VENV) -m sphinx -c docs --fail-on-warning --keep-going --quiet --doctree-dir build/doctrees . build/site
+	$(IN_VENV) docs/check_site.py build/site
+	@echo "Open build/site/index.html"
 
 test: lint ## install, lint and run the quick tests on all cores, with coverage
 	$(PYTEST) --dist worksteal -m "not slow" --cov --cov-report=term-missing:skip-covered --cov-fail-under=95
@@ -97,7 +104,7 @@ $(INSTALLED): $(REQUIREMENTS)
 	touch $@
 
 # All stamps are touched, because an extra installed earlier is still installed.
-$(SWEEPS_INSTALLED) $(TESTS_INSTALLED): $(STAMP)%: $(INSTALLED)
+$(SWEEPS_INSTALLED) $(DOCS_INSTALLED) $(TESTS_INSTALLED): $(STAMP)%: $(INSTALLED)
 	rm -f $(INSTALLED)
 	$(IN_VENV) -m pip install -c constraints.txt -e ".[$*]"
 	touch $(INSTALLED) $(filter-out $(INSTALLED),$@ $(wildcard $(STAMP)*))

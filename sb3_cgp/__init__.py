@@ -5,7 +5,7 @@ from sb3_cgp.common.version import __version__
 from sb3_cgp.core.cem import CEM, ActionSelector, Selection
 from sb3_cgp.export.policy import ExportedPolicy
 from sb3_cgp.fast.policies import CGPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
-from sb3_cgp.resumption import RestorableEnv, TrainingCheckpointCallback
+from sb3_cgp.resumption import RestorableEnv, TrainingCheckpointCallback, register_restorable
 
 __all__ = [
     "CEM",
@@ -20,4 +20,5 @@ __all__ = [
     "Selection",
     "TrainingCheckpointCallback",
     "__version__",
+    "register_restorable",
 ]

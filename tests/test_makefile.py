@@ -159,10 +159,10 @@ def test_resume_without_a_run_says_how_to_name_one(clone: Clone) -> None:
 
 
 def test_every_goal_installs_its_extra_once(clone: Clone) -> None:
-    goals = ("train", "sweeps", "test", "train", "test-slow", "sweeps", "resume")
+    goals = ("train", "sweeps", "docs", "test", "train", "test-slow", "sweeps", "docs", "resume")
     installed = [starting(clone.make(goal, RUN="logs/cgp/Ant-v5_2")[0], "-m pip") for goal in goals]
     extras = [[call.partition("-e ")[2] for call in calls] for calls in installed]
-    assert extras == [[".[zoo]"], [".[sweeps]"], [".[tests]"], [], [], [], []]
+    assert extras == [[".[zoo]"], [".[sweeps]"], [".[docs]"], [".[tests]"], [], [], [], [], []]
 
 
 def test_lint_checks_formatting_imports_and_types_and_test_uses_every_core(clone: Clone) -> None:
@@ -172,7 +172,16 @@ def test_lint_checks_formatting_imports_and_types_and_test_uses_every_core(clone
     assert all(starting(calls, prefix) for prefix in expected)
 
 
-@pytest.mark.parametrize("goal", ["train", "test", "sweeps"])
+def test_docs_are_built_without_warnings_and_their_links_checked(clone: Clone) -> None:
+    calls, ended = clone.make("docs")
+    assert ended.returncode == 0, ended.stderr
+    assert "--fail-on-warning" in calls[-2]
+    assert calls[-1] == "docs/check_site.py build/site"
+    _, ended = clone.make("docs", FAIL="docs/check_site.py")
+    assert ended.returncode != 0
+
+
+@pytest.mark.parametrize("goal", ["train", "test", "sweeps", "docs"])
 def test_nothing_is_installed_twice(clone: Clone, goal: str) -> None:
     clone.make(goal)
     calls, ended = clone.make(goal)
@@ -221,7 +230,7 @@ def test_old_python_is_refused_by_name(clone: Clone) -> None:
 def test_help_is_the_default_and_lists_every_goal(clone: Clone) -> None:
     calls, ended = clone.make()
     assert not calls
-    for goal in ("train", "resume", "sweeps", "test", "test-slow", "lint", "format", "clean"):
+    for goal in ("train", "resume", "sweeps", "docs", "test", "test-slow", "lint", "format", "clean"):
         assert f"make {goal} " in ended.stdout
 
 

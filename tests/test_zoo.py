@@ -7,11 +7,14 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import optuna
 import pytest
 import yaml
+from environments import Reach
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from optuna.distributions import CategoricalDistribution
 from optuna.trial import FixedTrial
 from rl_zoo3 import exp_manager, hyperparams_opt, utils
@@ -31,6 +34,14 @@ OTHER_TASKS = {"Pendulum-v1", "MountainCarContinuous-v0"} | {
     for task in ("InvertedPendulum", "InvertedDoublePendulum", "Reacher", "Swimmer", "Walker2d")
     for version in (4, 5)
 }
+# Packages that need not be installed, by their tasks
+PACKAGE_TASKS = {
+    "Box2D": {"LunarLanderContinuous-v3", "BipedalWalker-v3"},
+    "panda_gym": {f"Panda{task}-v3" for task in ("Reach", "Push", "Slide", "PickAndPlace", "Stack")},
+    "gymnasium_robotics": {f"Fetch{task}-v4" for task in ("Reach", "Push", "Slide", "PickAndPlace")},
+}
+GOAL_TASKS = PACKAGE_TASKS["panda_gym"] | PACKAGE_TASKS["gymnasium_robotics"]
+OTHER_TASKS |= set.union(*PACKAGE_TASKS.values())
 ENTRIES = yaml.safe_load((zoo.hyperparams_folder() / "cgp.yml").read_text())
 NO_HER = {"using_her_replay_buffer": False, "her_kwargs": {}}
 TINY = {"buffer_size": 100, "policy_kwargs": {"net_arch": [4]}}
@@ -155,12 +166,30 @@ def test_every_task_has_its_entry_and_the_papers_tasks_its_configuration():
 def test_every_entry_builds_a_model(env_id, tmp_path):
     if env_id == "Pusher-v4":
         pytest.skip("needs mujoco<3")
+    for package, tasks in PACKAGE_TASKS.items():
+        if env_id in tasks:
+            pytest.importorskip(package, reason=f"{package} is not installed")
     zoo.register()
     model, saved = manager(tmp_path, env_id=env_id, hyperparams={"buffer_size": 100}).setup_experiment()
     assert isinstance(model, CGP)
     assert model.gamma == ENTRIES[env_id]["gamma"]
     assert model.policy.net_arch == eval(ENTRIES[env_id]["policy_kwargs"])["net_arch"]
     assert (model.action_noise is not None) == ("noise_type" in saved)
+    assert (model.replay_buffer_class is HerReplayBuffer) == (env_id in GOAL_TASKS)
+
+
+@pytest.mark.parametrize("env_id", sorted(GOAL_TASKS))
+def test_every_entry_of_goals_is_one_that_a_goal_environment_trains_by(env_id, tmp_path, monkeypatch):
+    """Without the task's package."""
+    monkeypatch.setitem(gym.registry, "Reach-v0", EnvSpec("Reach-v0", entry_point=Reach, max_episode_steps=12))
+    (tmp_path / "reach.yml").write_text(yaml.safe_dump({"Reach-v0": ENTRIES[env_id]}))
+    zoo.register()
+    small = {"buffer_size": 100, "learning_starts": 30, "batch_size": 4, "policy_kwargs": "dict(net_arch=[4])"}
+    experiment = manager(tmp_path, env_id="Reach-v0", config=str(tmp_path / "reach.yml"), hyperparams=small)
+    model, _ = experiment.setup_experiment()
+    model.learn(34)
+    assert (model._n_updates, model.gamma, type(model.replay_buffer)) == (4, 0.95, HerReplayBuffer)
+    assert (model.get_vec_normalize_env() is not None) == ENTRIES[env_id].get("normalize", False)
 
 
 def checkpoints_of(experiment):

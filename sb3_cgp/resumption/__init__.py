@@ -2,7 +2,15 @@
 
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm, resumable
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
+from sb3_cgp.resumption.declarations import register_restorable
 from sb3_cgp.resumption.environments import RestorableEnv
 from sb3_cgp.resumption.locks import FolderInUseError
 
-__all__ = ["FolderInUseError", "RestorableEnv", "ResumableAlgorithm", "TrainingCheckpointCallback", "resumable"]
+__all__ = [
+    "FolderInUseError",
+    "RestorableEnv",
+    "ResumableAlgorithm",
+    "TrainingCheckpointCallback",
+    "register_restorable",
+    "resumable",
+]

@@ -7,6 +7,9 @@ These environments and wrappers can be restored:
 - the wrappers of Gymnasium, of ``rl_zoo3.wrappers`` and of ``sb3_contrib.common.wrappers``, and SB3's ``Monitor``,
 - SB3's vectorised environments and their wrappers; within ``SubprocVecEnv``, environments whose outermost wrapper is
   :class:`RestorableEnv`,
+- environments that derive from Gymnasium's ``MujocoEnv`` or Gymnasium-Robotics' ``MujocoRobotEnv`` and whose attributes are
+  plain data, and tasks of dm_control's suite in shimmy's ``DmControlCompatibilityV0``,
+- those of a class that :func:`~sb3_cgp.resumption.declarations.register_restorable` was given,
 - any other environment, wrapper or vectorised environment whose class has two methods:
   ``get_training_state()`` returns the object's state as plain data (see :func:`~sb3_cgp.resumption.plain_data.to_plain`),
   or ``None`` if it cannot be restored now, and ``set_training_state(state)`` restores it. Both may be called before the first
@@ -19,6 +22,7 @@ process by the caller.
 
 import random
 import re
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -28,7 +32,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
 from sb3_cgp.common.rules import require
-from sb3_cgp.resumption.layers import METHODS, is_known, layer_state, set_layer_state
+from sb3_cgp.resumption.declarations import METHODS, find_declaration, pickle_declarations, unpickle_declarations
+from sb3_cgp.resumption.layers import is_known, layer_state, set_layer_state
 
 
 class RestorableEnv(gym.Wrapper):
@@ -40,18 +45,20 @@ class RestorableEnv(gym.Wrapper):
     :param env: the environment
     """
 
-    def get_chain_state(self) -> dict[str, Any] | str:
+    def get_chain_state(self, declarations: list[bytes]) -> dict[str, Any] | str:
         """
         Copy the state of the wrapped environment, of all its wrappers, and of the process's random generators.
 
+        :param declarations: those of the training's process, as ``pickle_declarations`` returned them
         :return: plain data, or a description of the obstacles if the environment cannot be restored, as an error would end
             the process
         """
         problems: list[str] = []
         try:
+            unpickle_declarations(declarations)
             state = _chain_state(self, problems)
-        except ValueError as error:
-            return str(error)
+        except Exception as error:
+            return f"{type(error).__name__}: {error}"
         if problems:
             return " ".join(problems)
         # Wrappers draw from NumPy's global generator, as rl_zoo3's ActionNoiseWrapper does
@@ -145,7 +152,8 @@ def _states_in_processes(env: SubprocVecEnv, problems: list[str]) -> list[Any]:
     if not all("get_chain_state" in names for names in env.env_method("__dir__")):
         problems.append(_remedy_in_processes(env))
         return []
-    chains = env.env_method("get_chain_state")
+    declarations = pickle_declarations(problems)
+    chains = env.env_method("get_chain_state", declarations)
     problems.extend(chain for chain in chains if isinstance(chain, str))
     return chains
 
@@ -157,8 +165,11 @@ def _remedy_in_processes(env: SubprocVecEnv) -> str:
     # Gymnasium's description of an environment is <class<id>>
     found = re.search(r"<([^<>]+)<([^<>]+)>", described)
     spec = None if found is None else gym.registry.get(found[2])
-    module = spec.entry_point.partition(":")[0] if spec is not None and isinstance(spec.entry_point, str) else ""
-    if is_known(module) or all(env.env_method("has_wrapper_attr", "get_training_state")):
+    entry_point = None if spec is None else spec.entry_point
+    module, _, name = entry_point.partition(":") if isinstance(entry_point, str) else ("", "", "")
+    kind = getattr(sys.modules.get(module), name, None) if module else entry_point
+    is_declared = isinstance(kind, type) and find_declaration(kind) is not None
+    if is_known(module) or is_declared or all(env.env_method("has_wrapper_attr", "get_training_state")):
         return f"{missing} Make sb3_cgp.resumption.RestorableEnv its outermost wrapper."
     return f"{missing} RestorableEnv alone would not help: {described} has no {METHODS}, which it needs as well."
 
@@ -214,6 +225,7 @@ def _require_same(current: dict[str, Any], saved: dict[str, Any]) -> None:
         for part, describe in (
             ("spaces", lambda state: state["space"]),
             ("mujoco", lambda field: f"of shape {np.shape(field)}"),
+            ("mujoco_model", lambda field: f"of shape {np.shape(field)}"),
         ):
             our, their = ({name: describe(each) for name, each in layer.get(part, {}).items()} for layer in (ours, theirs))
             for name in sorted(our.keys() | their.keys()):

@@ -8,10 +8,19 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.wrappers import PassiveEnvChecker
 from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
-from sb3_cgp.resumption.mujoco_data import get_mujoco_data, is_restorable, mujoco_state, set_mujoco_state
+from sb3_cgp.resumption.declarations import METHODS, OWN, Declaration, find_declaration
+from sb3_cgp.resumption.mujoco_data import (
+    get_mujoco_data,
+    is_restorable,
+    model_state,
+    mujoco_state,
+    set_model_state,
+    set_mujoco_state,
+)
 from sb3_cgp.resumption.plain_data import NotPlainError, from_plain, plain_attributes, set_plain_attributes, to_plain
 
 RESTORABLE_MODULES = (
@@ -30,7 +39,7 @@ STATELESS_TYPES = (
     *(io.IOBase, np.dtype, np.ufunc, partial, spaces.Space, type),
 )
 # MuJoCo's model does not change; its data is saved separately
-STATELESS_MODULES = ("gymnasium.envs.mujoco.mujoco_rendering.", "mujoco.", "pygame.")
+STATELESS_MODULES = ("gymnasium.envs.mujoco.mujoco_rendering.", "gymnasium_robotics.utils.mujoco_utils.", "mujoco.", "pygame.")
 UNSAVED = {
     # The wrapped environments and stacks, each of which has a state of its own
     *("env", "envs", "venv", "obs_spaces", "sub_stacked_observations"),
@@ -45,8 +54,11 @@ UNSAVED = {
 }
 # The infos of the last step may hold values of any type; they are overwritten before they are read
 INFOS = {"buf_infos", "reset_infos"}
+# Of a checker whose last infos are no plain data: its checks of the first two steps, which only warn, are skipped
+CHECKED = {"_previous_data": None, "checked_step": True, "checked_data_reuse": True}
 RANDOM_STATE = {"_np_random", "_np_random_seed"}
-METHODS = "get_training_state() and set_training_state()"
+# They do not change their MuJoCo models; environments of others may
+CONSTANT_MODELS = "gymnasium.envs.mujoco."
 
 
 def layer_state(layer: Any, problems: list[str]) -> dict[str, Any]:
@@ -62,17 +74,23 @@ def layer_state(layer: Any, problems: list[str]) -> dict[str, Any]:
     name = f"{kind.__module__}.{kind.__qualname__}"
     state: dict[str, Any] = {"class": name}
     # Looked up in the class, as wrappers of vectorised environments forward the attributes of the wrapped one
-    if hasattr(kind, "get_training_state"):
-        state["own"] = _own_state(layer, name, problems)
+    declaration = find_declaration(kind)
+    if declaration is not None and declaration.get is not None:
+        state["own"] = _own_state(layer, name, declaration, problems)
         state["attributes"] = plain_attributes(layer, without=vars(layer).keys() - RANDOM_STATE)
     else:
         state["attributes"] = plain_attributes(layer, UNSAVED)
-        problems.extend(_problems(layer, name, state["attributes"].keys()))
+        if kind is PassiveEnvChecker and "_previous_data" not in state["attributes"]:
+            state["attributes"] |= CHECKED
+        is_declared = declaration is not None
+        problems.extend(_problems(layer, name, state["attributes"].keys(), is_declared))
     state["spaces"] = {key: _space_state(value) for key, value in vars(layer).items() if isinstance(value, spaces.Space)}
     data = get_mujoco_data(layer)
     if data is not None:
         if is_restorable(data):
             state["mujoco"] = mujoco_state(data)
+            if not name.startswith(CONSTANT_MODELS):
+                state["mujoco_model"] = model_state(data.model)
         else:
             problems.append(f"{name} has a MuJoCo model with plugins, flexible bodies or sleep.")
     return state
@@ -87,13 +105,18 @@ def set_layer_state(layer: Any, state: dict[str, Any]) -> None:
     """
     # First, as this method may draw random numbers
     if "own" in state:
-        layer.set_training_state(from_plain(state["own"]))
+        declaration = find_declaration(type(layer))
+        assert declaration is not None
+        assert declaration.set is not None
+        declaration.set(layer, from_plain(state["own"]))
     set_plain_attributes(layer, state["attributes"])
     for name, space_state in state["spaces"].items():
         _set_space_state(vars(layer)[name], space_state)
     data = get_mujoco_data(layer)
     if data is not None:
         set_mujoco_state(data, state["mujoco"])
+        if "mujoco_model" in state:
+            set_model_state(data.model, state["mujoco_model"])
 
 
 def is_known(module: str) -> bool:
@@ -105,23 +128,26 @@ def is_known(module: str) -> bool:
     return f"{module}.".startswith(RESTORABLE_MODULES)
 
 
-def _own_state(layer: Any, name: str, problems: list[str]) -> Any:
-    own = layer.get_training_state()
+def _own_state(layer: Any, name: str, declaration: Declaration, problems: list[str]) -> Any:
+    assert declaration.get is not None
+    own = declaration.get(layer)
+    described = f"{name}{declaration.described}"
     if own is None:
-        problems.append(f"{name}.get_training_state() returned None.")
-    if not hasattr(type(layer), "set_training_state"):
+        problems.append(f"{described} returned None.")
+    if declaration is OWN and not hasattr(type(layer), "set_training_state"):
         problems.append(f"{name} has a get_training_state() and no set_training_state(): it needs {METHODS}.")
     try:
         return to_plain(own)
     except NotPlainError as error:
-        message = f"{name}.get_training_state() returned {own!r}, but must return plain data: {error}"
+        message = f"{described} returned {own!r}, but must return plain data: {error}"
         raise ValueError(message) from error
 
 
-def _problems(layer: Any, name: str, saved: Any) -> list[str]:
-    """Return a sentence for each obstacle to restoring a layer without methods of its own."""
-    if not is_known(type(layer).__module__):
-        return [f"{name} is unknown and has no get_training_state(): it needs {METHODS}."]
+def _problems(layer: Any, name: str, saved: Any, is_declared: bool) -> list[str]:
+    """Return a sentence for each obstacle to restoring a layer whose state is its attributes."""
+    if not (is_declared or is_known(type(layer).__module__)):
+        remedy = f"it needs {METHODS}, or sb3_cgp.register_restorable"
+        return [f"{name} is unknown and has no get_training_state(): {remedy}."]
     unsaved = {key: vars(layer)[key] for key in vars(layer).keys() - saved - UNSAVED - INFOS}
     obstacles = {key: value for key, value in sorted(unsaved.items()) if not _is_stateless(value)}
     return [f"{name}.{key} is {value!r}, which is not plain data." for key, value in obstacles.items()]

@@ -1,9 +1,13 @@
-"""The state of a MuJoCo simulation."""
+"""The state of a MuJoCo simulation, and of its model."""
 
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+
+# Fields of a model that are large, and that no step of an environment changes
+GEOMETRY = ("bvh", "flex", "mesh", "oct", "skin", "tex")
+CONTACT_FLAGS = {"geom_conaffinity", "geom_contype"}
 
 
 def get_mujoco_data(layer: Any) -> Any:
@@ -52,6 +56,45 @@ def set_mujoco_state(data: Any, state: dict[str, Any]) -> None:
     data.time = state["time"]
     for name, field in _fields(data):
         field[...] = state[name]
+
+
+def model_state(model: Any) -> dict[str, Any]:
+    """
+    Copy the parts of a MuJoCo model that environments change, as those do that randomise masses, sizes or places.
+
+    :param model: MuJoCo's model
+    :return: the fields by name, those of its options after "opt."
+    """
+    options = {f"opt.{name}": np.copy(getattr(model.opt, name)) for name in _names(model.opt, "fi")}
+    return {name: field.copy() for name, field in _model_fields(model)} | options
+
+
+def set_model_state(model: Any, state: dict[str, Any]) -> None:
+    """
+    Restore the parts of a MuJoCo model that environments change.
+
+    :param model: the model, of the same structure
+    :param state: the state that :func:`model_state` returned
+    """
+    for name, field in _model_fields(model):
+        field[...] = state[name]
+    for name in _names(model.opt, "fi"):
+        value = state[f"opt.{name}"]
+        setattr(model.opt, name, value if value.ndim else value.item())
+
+
+def _names(struct: Any, kinds: str) -> list[str]:
+    """List the numeric fields of one of MuJoCo's structures."""
+    names = [name for name in dir(struct) if not name.startswith("_")]
+    return [name for name in names if np.asarray(getattr(struct, name)).dtype.kind in kinds]
+
+
+def _model_fields(model: Any) -> Iterator[tuple[str, np.ndarray]]:
+    """List the fields of a model that may change between its steps, as writable arrays: all numbers, but for geometry."""
+    for name in dir(model):
+        field = None if name.startswith(("_", *GEOMETRY)) else getattr(model, name)
+        if isinstance(field, np.ndarray) and field.size and (field.dtype.kind in "fb" or name in CONTACT_FLAGS):
+            yield name, field
 
 
 def _fields(data: Any) -> Iterator[tuple[str, np.ndarray]]:

@@ -1,0 +1,84 @@
+"""
+Check a built site without a network: every internal link, anchor, image and script exists, and no page loads from elsewhere.
+
+`python docs/check_site.py FOLDER` prints what is wrong, and exits with status 1 if anything is.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+# What a browser loads with the page, by the attribute that names it
+LOADED = {"img": "src", "script": "src", "source": "src", "video": "src", "iframe": "src", "link": "href"}
+
+
+class Page(HTMLParser):
+    """The anchors of a page, and the addresses that it links to and loads."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.anchors = {""}
+        self.linked: list[str] = []
+        self.loaded: list[str] = []
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        attributes = dict(attrs)
+        self.anchors |= {value for name in ("id", "name") if (value := attributes.get(name))}
+        if tag == "a" and (address := attributes.get("href")):
+            self.linked.append(address)
+        if tag in LOADED and (address := attributes.get(LOADED[tag])):
+            self.loaded.append(address)
+
+
+def find_faults(folder: Path) -> Iterator[str]:
+    """
+    Yield a line for every fault of the site.
+
+    :param folder: the folder of the built site
+    """
+    pages = {path.resolve(): Page(path) for path in sorted(folder.rglob("*.html"))}
+    if not pages:
+        yield f"{folder}: no page"
+    for path, page in pages.items():
+        name = path.relative_to(folder.resolve())
+        yield from (f"{name}: loads {address} from a network" for address in page.loaded if is_external(address))
+        for address in page.linked + page.loaded:
+            if not is_external(address) and (fault := find_fault(path, address, pages)):
+                yield f"{name}: {address}: {fault}"
+
+
+def is_external(address: str) -> bool:
+    """Return whether an address has a scheme or a host, so that it is not a file of the site; data within the page is none."""
+    parts = urlsplit(address)
+    return parts.scheme != "data" and bool(parts.scheme or parts.netloc)
+
+
+def find_fault(path: Path, address: str, pages: dict[Path, Page]) -> str | None:
+    """
+    Return what is wrong with an internal address, or None.
+
+    :param path: the page that has the address
+    :param address: a link, relative to the page
+    :param pages: all pages of the site
+    """
+    parts = urlsplit(address)
+    if parts.scheme == "data":
+        return None
+    target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+    if not target.is_file():
+        return "no such file"
+    if target in pages and unquote(parts.fragment) not in pages[target].anchors:
+        return "no such anchor"
+    return None
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    faults = list(find_faults(parser.parse_args().folder))
+    print("".join(f"{fault}\n" for fault in faults), end="")
+    sys.exit(bool(faults))

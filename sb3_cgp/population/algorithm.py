@@ -1,0 +1,269 @@
+"""The population: SB3's loop around the gradient step of many agents."""
+
+import io
+import pathlib
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+
+from sb3_cgp.algorithm import CGP
+from sb3_cgp.common.random_state import preserved_random_state
+from sb3_cgp.common.rules import require
+from sb3_cgp.common.sb3_arguments import as_schedule
+from sb3_cgp.core.policies import CGPPolicy
+from sb3_cgp.population.agents import (
+    COMMON,
+    OWN,
+    Arguments,
+    check_networks,
+    check_supported,
+    join_action_noise,
+    make_agent,
+    merge_arguments,
+)
+from sb3_cgp.population.gradient_step import AgentNumbers
+from sb3_cgp.population.policies import PopulationPolicy
+from sb3_cgp.population.replay import copied_column
+from sb3_cgp.population.training import PopulationTraining
+from sb3_cgp.resumption.algorithm import ResumableAlgorithm
+
+SelfPopulation = TypeVar("SelfPopulation", bound="Population")
+
+
+class Population(ResumableAlgorithm, PopulationTraining):
+    """
+    N agents of CGP that are trained in lockstep, each in its own environment.
+
+    ``population[i]`` is agent i as an ordinary :class:`sb3_cgp.CGP`. As SB3 does with several environments,
+    ``num_timesteps`` and the ``total_timesteps`` of ``learn`` count the steps of all environments; the agents' arguments, such
+    as ``learning_starts`` and ``buffer_size``, count those of one agent. CGP's diagnostics are not logged.
+
+    :param policy: "MlpPolicy", or its class
+    :param env: the name of an environment, which is made once for each agent, or a ``VecEnv`` of N environments
+    :param agents: the number of agents, or for each agent a dictionary of the arguments that it does not share: ``seed``,
+        ``learning_rate``, ``actor_learning_rate``, ``learning_starts``, ``tau``, ``gamma``, ``action_noise``,
+        ``policy_delay``, ``target_update_interval``, ``target_policy_noise`` and ``target_noise_clip``
+    :param device: Device (cpu, cuda, ...) on which the code should be run.
+    :param arguments: CGP's arguments for all agents. With ``seed``, agent i has the seed ``seed + i``.
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :raises ValueError: if an argument is out of its range, differs between agents and may not, or is not supported
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = CGP.policy_aliases
+
+    def __init__(
+        self,
+        policy: str | type[CGPPolicy],
+        env: GymEnv | str | None,
+        agents: int | Sequence[Arguments] = 1,
+        *,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+        **arguments: Any,
+    ):
+        self.agents = merge_arguments(agents, arguments)
+        self.cuda_graphs = self.agents[0].get("cuda_graphs", True)
+        self._failures: list[str | None] = [None] * len(self.agents)
+        self._agent_updates = np.zeros(len(self.agents), dtype=np.int64)
+        # Whether the actors have been trained offline
+        self._policy_is_trained = False
+        first = self.agents[0]
+        super().__init__(
+            policy,
+            make_vec_env(env, n_envs=len(self.agents)) if isinstance(env, str) else env,  # type: ignore[arg-type]
+            first.get("learning_rate", 1e-3),
+            policy_kwargs=first.get("policy_kwargs"),
+            replay_buffer_kwargs=first.get("replay_buffer_kwargs"),
+            stats_window_size=first.get("stats_window_size", 100),
+            tensorboard_log=first.get("tensorboard_log"),
+            verbose=first.get("verbose", 0),
+            seed=first.get("seed"),
+            device=device,
+            support_multi_env=True,
+            sde_support=False,
+        )
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_lr_schedule(self) -> None:
+        # Not used: each agent has its own, `_schedules`
+        self.lr_schedule = as_schedule(self.learning_rate)
+
+    def _setup_model(self) -> None:
+        n_agents = len(self)
+        self._check_env()
+        check_supported(self.policy_class, self.agents[0], self.observation_space)
+        spaces = self.observation_space, self.action_space
+        # On the CPU, where a CGP alone draws its first parameters too
+        agents = [make_agent(self.policy_class, each, *spaces, "cpu") for each in self.agents]  # type: ignore[arg-type]
+        check_networks(agents[0])
+        for name in ("batch_size", "n_steps", "train_freq", "gradient_steps"):
+            setattr(self, name, getattr(agents[0], name))
+        # SB3 divides the one by the number of environments, and compares the other with the steps of all
+        self.buffer_size = n_agents * agents[0].buffer_size
+        self.learning_starts = n_agents * min(agent.learning_starts for agent in agents)
+        # SB3 makes a policy, which is replaced below: the random numbers that follow are those of an agent alone
+        super()._setup_model()
+        if self.action_noise is None:
+            self.action_noise = join_action_noise(agents)
+        self.policy = PopulationPolicy(*spaces, agents).to(self.device)  # type: ignore[arg-type]
+        self._choose_inference()
+        self._schedules = [(agent.lr_schedule, agent.actor_lr_schedule) for agent in agents]
+        self._numbers = AgentNumbers.of(agents, self.device)
+        names = ("learning_starts", "policy_delay", "target_update_interval")
+        self._counts = {name: np.array([getattr(agent, name) for agent in agents]) for name in names}
+        self._recorded = {}
+        self._unlogged = ()
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        Set the seeds of the random generators, and the agents' own ones of their environments.
+
+        :param seed: the seed of the generators that the agents share
+        """
+        super().set_random_seed(seed)
+        if self.env is not None:
+            for index, arguments in enumerate(self.agents):
+                # SB3 counts the environments' seeds from one number
+                self.env.unwrapped._seeds[index] = arguments.get("seed")
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
+        # `set_env` may have changed it
+        self._check_env()
+        return super()._setup_learn(*args, **kwargs)
+
+    def _check_env(self) -> None:
+        """
+        Check that the environments are the agents' own.
+
+        :raises ValueError: if there are more or fewer than agents, or they share the statistics of ``VecNormalize``
+        """
+        allowed = f"{len(self)}, as many as agents: environment i is agent i's"
+        require(self.env is None or self.n_envs == len(self), "env.num_envs", self.n_envs, allowed)
+        allowed = "without VecNormalize, whose statistics all agents would share"
+        require(self._vec_normalize_env is None, "env", self.env, allowed)
+
+    def _choose_inference(self) -> None:
+        """Let ``predict`` use the network that the user chose, or the selector while no actor is trained."""
+        has_actor = self._trains_online or (self._policy_loss is not None and self._policy_is_trained)
+        self.policy.inference = (self.agents[0].get("inference") or "actor") if has_actor else "cem"
+        self.policy.actor_proposes = has_actor
+
+    def learn(
+        self: SelfPopulation,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "Population",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfPopulation:
+        """
+        Learn as SB3's algorithms do. With offline training, train the agents' policies at the end, one after another.
+
+        :param total_timesteps: number of steps of all environments together
+        :param callback: callback(s) called at every step with state of the algorithm.
+        :param log_interval: number of episodes, of all environments together, between two writings of the log
+        :param tb_log_name: the name of the run for TensorBoard logging
+        :param reset_num_timesteps: whether or not to reset the current timestep number (used in logging)
+        :param progress_bar: Display a progress bar using tqdm and rich.
+        :return: the trained population
+        :raises ValueError: if all agents have failed
+        """
+        super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        self._report_failures()
+        if self._policy_loss is not None and not self._trains_online and self._agent_updates.any():
+            self._train_policies()
+        return self
+
+    def _train_policies(self) -> None:
+        """Train the actors offline, each by its own CGP."""
+        for index in set(range(len(self))) - set(self.failed):
+            agent = self._make_agent(index)
+            assert self.replay_buffer is not None
+            agent.replay_buffer = copied_column(self.replay_buffer, index)
+            agent.set_logger(self.logger)
+            self.policy.copy_actor_from(agent.train_policy(), index)
+        self._policy_is_trained = True
+        self._choose_inference()
+
+    def __len__(self) -> int:
+        return len(self.agents)
+
+    def __iter__(self) -> Iterator[CGP]:
+        return map(self.__getitem__, range(len(self)))
+
+    def __getitem__(self, index: int) -> CGP:
+        """
+        Return a copy of an agent as an ordinary CGP, which predicts, saves, loads and exports, without an environment.
+
+        :param index: the agent's index
+        :return: the agent
+        :raises IndexError: if there is no such agent
+        """
+        return self.agent(index)
+
+    def agent(self, index: int, env: GymEnv | None = None) -> CGP:
+        """
+        Return a copy of an agent as an ordinary CGP.
+
+        :param index: the agent's index
+        :param env: an environment to go on training in by ``learn(..., reset_num_timesteps=False)``. The agent then also has a
+            copy of its transitions.
+        :return: the agent
+        :raises IndexError: if there is no such agent
+        """
+        index = range(len(self))[index]
+        agent = self._make_agent(index)
+        if env is not None:
+            agent.set_env(env)
+            if self.replay_buffer is not None:
+                agent.replay_buffer = copied_column(self.replay_buffer, index)
+        return agent
+
+    def _make_agent(self, index: int) -> CGP:
+        spaces = self.observation_space, self.action_space
+        with preserved_random_state(self.device):
+            agent = make_agent(self.policy_class, self.agents[index], *spaces, self.device)  # type: ignore[arg-type]
+        self.policy.copy_to(agent, index)
+        agent.num_timesteps = self.num_timesteps // len(self)
+        agent._n_updates = int(self._agent_updates[index])
+        agent._current_progress_remaining = self._current_progress_remaining
+        is_online = self._trains_online and agent._n_updates >= agent.policy_delay
+        agent._policy_is_trained = self._policy_is_trained or is_online
+        agent._policy_is_due = not self._trains_online and not self._policy_is_trained and agent._n_updates > 0
+        agent._choose_inference()
+        return agent
+
+    @classmethod
+    def load(
+        cls: type[SelfPopulation],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        *args: Any,
+        **kwargs: Any,
+    ) -> SelfPopulation:
+        """
+        Load a population from a zip-file, as SB3 does, without a replay buffer until ``learn`` allocates it.
+
+        :param path: path to the file (or a file-like)
+        :param env: the environments, one for each agent; None for predictions alone
+        :param args: the further parameters of SB3's ``load``
+        :param kwargs: the same by keyword
+        :return: the population
+        :raises ValueError: if an argument of the agents is given, which a saved population has for each of them
+        """
+        for name in {*OWN, *COMMON} & kwargs.keys():
+            require(name in ("verbose", "tensorboard_log"), name, kwargs[name], "left out: change it in a new population")
+        return super().load(path, env, *args, **kwargs)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_schedules", "_numbers", "_counts", "_recorded", "_unlogged"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy"], []

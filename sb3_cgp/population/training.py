@@ -1,0 +1,188 @@
+"""The training of a population: acting, gradient steps, failures and the log, within SB3's loop."""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_cgp.fast.cuda_graphs import RecordedFunction, Tensors, has_cuda_graphs
+from sb3_cgp.fast.replay import LeanReplayAlgorithm
+from sb3_cgp.guards.dummy_vec_env import DummyVecEnvGuard
+from sb3_cgp.guards.episodes import EpisodeGuard
+from sb3_cgp.guards.explanations import ExplanationGuard
+from sb3_cgp.guards.learning_starts import LearningStartsGuard
+from sb3_cgp.guards.parts import PartsGuard
+from sb3_cgp.guards.transitions import TransitionGuard
+from sb3_cgp.guards.workers import WorkerGuard
+from sb3_cgp.population.agents import Arguments
+from sb3_cgp.population.gradient_step import AgentNumbers, GradientStep
+from sb3_cgp.population.policies import PopulationPolicy
+from sb3_cgp.population.replay import sample_columns
+
+# Gradient steps between two checks of the losses on a GPU, each of which synchronizes with it
+CHECK_INTERVAL = 100
+# Keys of the losses in the log, in the order in which a gradient step returns them
+LOSSES = ("critic_loss", "q_value", "actor_loss")
+
+
+class PopulationTraining(
+    # CGP's guards, but for those of networks, losses and VecNormalize: each agent's own CGP has tried its networks
+    WorkerGuard,
+    ExplanationGuard,
+    DummyVecEnvGuard,
+    PartsGuard,
+    TransitionGuard,
+    EpisodeGuard,
+    LearningStartsGuard,
+    LeanReplayAlgorithm,
+):
+    """
+    The part of :class:`~sb3_cgp.population.algorithm.Population` that trains: what an agent does in ``core/cgp.py``, for all.
+    """
+
+    policy: PopulationPolicy
+    # The arguments of each agent
+    agents: list[Arguments]
+    # Why an agent has failed
+    _failures: list[str | None]
+    # Gradient steps of each agent
+    _agent_updates: np.ndarray
+    # The critics' and the actors' learning rates of each agent
+    _schedules: list[tuple[Schedule, Schedule]]
+    _numbers: AgentNumbers
+    # Arguments that count steps, by their names, (N,)
+    _counts: dict[str, np.ndarray]
+    # CUDA graphs by (some agent trains its actor, some agent moves its averages)
+    _recorded: dict[tuple[bool, bool], RecordedFunction]
+    # The results of the last gradient step
+    _unlogged: Tensors
+
+    @property
+    def _policy_loss(self) -> str | None:
+        return self.agents[0].get("policy_loss", "cgp")
+
+    @property
+    def _trains_online(self) -> bool:
+        return self._policy_loss is not None and self.agents[0].get("policy_training", "online") == "online"
+
+    @property
+    def failed(self) -> dict[int, str]:
+        """The agents whose training has failed, and why. Their parameters do not change any more."""
+        return {index: reason for index, reason in enumerate(self._failures) if reason is not None}
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        # As SB3 does, with a warm-up of each agent's own
+        is_random = self.num_timesteps // n_envs < self._counts["learning_starts"]
+        actions = np.zeros((n_envs, *(self.action_space.shape or ())), dtype=self.action_space.dtype)
+        if is_random.any():
+            actions[:] = [self.action_space.sample() for _ in range(n_envs)]
+        if not is_random.all():
+            assert self._last_obs is not None
+            with self.policy.acting_by("cem"):
+                selected, _ = self.predict(self._last_obs)
+            actions[~is_random] = selected[~is_random]
+        scaled = self.policy.scale_action(actions)
+        if action_noise is not None:
+            scaled = np.clip(scaled + action_noise(), -1, 1)
+        return self.policy.unscale_action(scaled), scaled
+
+    def train(self, gradient_steps: int, batch_size: int = 128) -> None:
+        """
+        Do gradient steps with all agents that have begun to learn and have not failed.
+
+        :param gradient_steps: number of gradient steps
+        :param batch_size: number of transitions in an agent's minibatch
+        :raises ValueError: if all agents have failed
+        """
+        assert self.replay_buffer is not None
+        if self.gradient_steps < 0:
+            # As many as steps in one environment
+            gradient_steps //= self.n_envs
+        self.policy.set_training_mode(True)
+        self._update_learning_rates()
+        learns = self.num_timesteps // self.n_envs > self._counts["learning_starts"]
+        learns &= np.array([failure is None for failure in self._failures])
+        n_updates_before = self._n_updates
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            self._agent_updates += learns
+            is_due = [self._agent_updates % self._counts[name] == 0 for name in ("policy_delay", "target_update_interval")]
+            trains_actor, moves_averages = (each & learns for each in is_due)
+            trains_actor &= self._trains_online
+            due = th.from_numpy(np.stack([self._agent_updates, learns, trains_actor, moves_averages]))
+            batch = sample_columns(self.replay_buffer, batch_size, self._numbers.gammas)
+            inputs = (*batch, due.to(self.device, non_blocking=True))
+            self._unlogged = self._carry_out((bool(trains_actor.any()), bool(moves_averages.any())), inputs)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        interval = CHECK_INTERVAL if self.device.type == "cuda" else 1
+        if self._n_updates // interval > n_updates_before // interval:
+            self._report_failures()
+
+    def _update_learning_rates(self) -> None:
+        """Set the agents' learning rates by their schedules, and log their means."""
+        rates = np.array([[schedule(self._current_progress_remaining) for schedule in each] for each in self._schedules])
+        optimizers = (self.policy.critic_optimizer, self.policy.actor_optimizer)
+        for name, optimizer, own in zip(("learning_rate", "actor_learning_rate"), optimizers, rates.T, strict=True):
+            self.logger.record(f"train/{name}", own.mean())
+            optimizer.rates.copy_(th.from_numpy(own).view(-1, 1, 1), non_blocking=True)
+
+    def _carry_out(self, due: tuple[bool, bool], inputs: Sequence[th.Tensor]) -> Tensors:
+        """Carry a gradient step out, as a CUDA graph where possible: one for each combination of what is due."""
+        step = GradientStep(self.policy, self._numbers, self._policy_loss, *due)
+        if not (self.cuda_graphs and has_cuda_graphs(self.device)):
+            return step(*inputs)
+        if due not in self._recorded:
+            self._recorded[due] = RecordedFunction(lambda: [*self.policy.parameters(), *self.policy.buffers()])
+        return self._recorded[due](step, *inputs)
+
+    def _report_failures(self) -> None:
+        """
+        Read on the host which agents have failed, and warn of the new ones.
+
+        :raises ValueError: if all agents have failed
+        """
+        for name, steps in zip(("critic", "actor"), self.policy.failed_at.tolist(), strict=True):
+            for index, step in enumerate(steps):
+                if step >= 0 and self._failures[index] is None:
+                    self._failures[index] = f"The {name} loss was NaN or infinite at gradient step {step}."
+                    self._agent_updates[index] = step
+                    warnings.warn(
+                        f"Agent {index} has failed. {self._failures[index]} Its {name} is as before that step, and stays so. "
+                        "The other agents go on.",
+                        stacklevel=2,
+                    )
+        if None not in self._failures:
+            raise ValueError(f"All agents have failed, the last one for this reason: {self._failures[-1]}")
+
+    def _record_losses(self) -> None:
+        """Log the means of the last losses over the agents that learn."""
+        counts = self._agent_updates > 0
+        counts &= np.array([failure is None for failure in self._failures])
+        for name, values in zip(LOSSES, self._unlogged, strict=False):
+            if values is not None and counts.any():
+                self.logger.record(f"train/{name}", float(np.mean(values.numpy(force=True)[counts])))
+        self.logger.record("train/failed_agents", len(self.failed))
+        self._unlogged = ()
+
+    def dump_logs(self) -> None:
+        """Write log data."""
+        self._record_losses()
+        super().dump_logs()
+
+    def get_training_state(self) -> dict[str, Any]:
+        """
+        Return nothing further, but update the log and the failures, which are part of a saved state.
+
+        :return: the training state of the other parts of the model
+        :raises ValueError: if all agents have failed
+        """
+        self._report_failures()
+        self._record_losses()
+        inherited = getattr(super(), "get_training_state", dict)
+        return inherited()

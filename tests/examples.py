@@ -1,0 +1,42 @@
+"""Run the Python examples of a page, shortened."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from sb3_cgp import CGP
+
+ROOT = Path(__file__).parent.parent
+# Past the warm-up of the shortened examples
+STEPS = 60
+WARM_UP = 50
+
+
+def python_examples(page: str) -> list[str]:
+    """Return the Python blocks of a Markdown file, given relative to the repository's root."""
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
+
+
+def run_in_order(page: str, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    """
+    Run all Python blocks of a page one after another in a folder, each as a script of its own.
+
+    Trainings take few steps, of which some are gradient steps, and evaluations one episode. What is shortened are the numbers
+    alone: arguments are checked as they are.
+    """
+    learn, construct = CGP.learn, CGP.__init__
+
+    def construct_short(self: CGP, *args: object, **kwargs: object) -> None:
+        construct(self, *args, **kwargs)
+        self.learning_starts = min(self.learning_starts, WARM_UP)
+
+    def learn_short(self: CGP, total_timesteps: int, *args: object, **kwargs: object) -> CGP:
+        return learn(self, min(total_timesteps, STEPS), *args, **kwargs)
+
+    monkeypatch.setattr(CGP, "__init__", construct_short)
+    monkeypatch.setattr(CGP, "learn", learn_short)
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 2)
+    monkeypatch.chdir(folder)
+    for example in python_examples(page):
+        exec(compile(example, page, "exec"), {"__name__": "__main__"})

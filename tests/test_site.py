@@ -1,0 +1,86 @@
+"""The pages' examples run, the numbers on hyperparameters are those of the records, and faults of a built site are found."""
+
+import re
+import runpy
+
+import pytest
+from examples import ROOT, python_examples, run_in_order
+
+import sb3_cgp.resumption
+import sb3_cgp.selectors
+import sb3_cgp.zoo
+
+# Those whose examples have tests of their own, or belong to the clone
+ELSEWHERE = {"docs/architecture.md", "docs/experiments.md", "docs/trust.md"}
+PAGES = sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))
+WITH_EXAMPLES = [page for page in PAGES if page not in ELSEWHERE and python_examples(page)]
+RESULTS = (ROOT / "benchmark/results/sweeps/results.md").read_text()
+
+
+def test_pages_have_examples():
+    assert {"docs/quickstart.md", "docs/algorithm.md", "docs/robot.md", "docs/environments.md"} <= set(WITH_EXAMPLES)
+
+
+@pytest.mark.parametrize("page", WITH_EXAMPLES)
+def test_examples_of_a_page_run_in_order(page, monkeypatch, tmp_path):
+    run_in_order(page, monkeypatch, tmp_path)
+
+
+def cells(line):
+    return [cell.strip() for cell in line.strip().strip("|").split("|")]
+
+
+def test_figures_on_hyperparameters_are_those_of_the_sweeps():
+    page = (ROOT / "docs" / "hyperparameters.md").read_text()
+    rows = [cells(line) for line in page.splitlines() if re.match(r"\| [a-z ]+ [\d.a-z]+.*\(-", line)]
+    recorded = [cells(line) for line in RESULTS.splitlines() if line.startswith("| Pendulum-v1 |") and "CGP-Online" in line]
+    # settings, method, interval, mean, lowest
+    recorded = {(row[1], row[3], row[5]) for row in recorded if len(row) == 9}
+    assert len(rows) == 24
+    assert [row for row in rows if tuple(row) not in recorded] == []
+
+
+def test_every_public_name_is_documented_once():
+    reference = "".join((ROOT / "docs" / page).read_text() for page in ("algorithm.md", "api.md"))
+    documented = [name.rpartition(".")[2] for name in re.findall(r"\.\. auto(?:class|function|exception):: (\S+)", reference)]
+    modules = (sb3_cgp, sb3_cgp.resumption, sb3_cgp.selectors, sb3_cgp.zoo)
+    public = {name for module in modules for name in module.__all__} - {"__version__"}
+    assert sorted(documented) == sorted(public)
+
+
+CHECK = runpy.run_path(str(ROOT / "docs" / "check_site.py"))["find_faults"]
+GOOD = (
+    '<h1 id="top">A</h1><a href="b.html#part">b</a><a href="#top">up</a><img src="i.png"><a href="https://example.org">out</a>'
+)
+
+
+@pytest.fixture
+def site(tmp_path):
+    (tmp_path / "a.html").write_text(GOOD)
+    (tmp_path / "b.html").write_text('<h1 id="part">B</h1><img src="data:image/png;base64,AA==">')
+    (tmp_path / "i.png").write_bytes(b"")
+    return tmp_path
+
+
+def test_a_whole_site_has_no_fault(site):
+    assert list(CHECK(site)) == []
+
+
+@pytest.mark.parametrize(
+    ("broken", "fault"),
+    [
+        ('<a href="c.html">c</a>', "a.html: c.html: no such file"),
+        ('<a href="b.html#other">b</a>', "a.html: b.html#other: no such anchor"),
+        ('<a href="#other">a</a>', "a.html: #other: no such anchor"),
+        ('<img src="j.png">', "a.html: j.png: no such file"),
+        ('<script src="https://cdn.example.org/x.js"></script>', "a.html: loads https://cdn.example.org/x.js from a network"),
+        ('<link rel="stylesheet" href="//example.org/x.css">', "a.html: loads //example.org/x.css from a network"),
+    ],
+)
+def test_a_fault_of_a_site_is_named(site, broken, fault):
+    (site / "a.html").write_text(GOOD + broken)
+    assert list(CHECK(site)) == [fault]
+
+
+def test_a_folder_without_pages_is_a_fault(tmp_path):
+    assert list(CHECK(tmp_path)) == [f"{tmp_path}: no page"]
