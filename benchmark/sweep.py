@@ -65,7 +65,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--results",
         type=output_folder,
-        default=FOLDER,
+        # argparse converts texts only
+        default=str(FOLDER),
         help="folder of the results (default: %(default)s)",
     )
     parser.add_argument(

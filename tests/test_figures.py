@@ -2,6 +2,7 @@
 
 import shlex
 import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from tables import unpadded
 
+from benchmark import sweep
+from benchmark.common.measuring import measuring_parser
 from benchmark.common.style import FURTHER, METHODS, styles
 from benchmark.figures import main
 from benchmark.reporting import drawing
@@ -24,6 +27,7 @@ from benchmark.reporting.figures import figures, study_folders
 from benchmark.reporting.page import reward_tables
 from benchmark.reporting.scores import curves, evaluation_grid, read_study, score_table
 
+ROOT = Path(__file__).parents[1]
 GRID = [{"learning_rate": rate, "batch_size": size} for rate in (0.01, 0.001) for size in (64, 32)]
 BASELINES = ["CGP-Online", "TD3", "SAC"]
 LEVELS = {"CGP-Online": -150.0, "TD3": -300.0, "SAC": -200.0}
@@ -316,6 +320,17 @@ def test_printed_sweep_commands_name_a_folder_that_is_not_the_default(monkeypatc
         (line,) = [line for line in text.splitlines() if line.startswith("The runs: ")]
         assert option in line
         assert ("--results" in line) == ("--results" in option)
+
+
+@pytest.mark.skipif(shutil.which("git") is None or not (ROOT / ".git").exists(), reason="needs a clone")
+def test_the_results_of_a_user_are_not_tracked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    folders = [sweep.parse(["e3"]).results, command.FOLDER, measuring_parser("runtime", "").parse_args([]).folder]
+    assert folders == [Path("results/sweeps"), Path("results/sweeps"), Path("results/runtime")]
+    for folder in folders:
+        assert subprocess.run(["git", "check-ignore", "-q", f"{folder}/results.md"], cwd=ROOT, check=False).returncode == 0
+    tracked = "benchmark/results/sweeps/results.md"
+    assert subprocess.run(["git", "check-ignore", "-q", tracked], cwd=ROOT, check=False).returncode == 1
 
 
 def make(folder: Path) -> Path:

@@ -81,14 +81,23 @@ def test_runs_are_recorded_as_they_end_and_not_repeated(tmp_path, monkeypatch):
 def test_a_run_trains_with_its_data_type_and_compares_elites(tmp_path, monkeypatch):
     monkeypatch.setattr(elites, "STATES", 50)
     monkeypatch.setattr(precision_runs, "EPISODES", 2)
-    options = ["--folder", str(tmp_path), "--envs", "Pendulum-v1", "--seeds", "3", "--steps", "10001"]
+    options = ["--folder", str(tmp_path), "--envs", "Pendulum-v1", "--seeds", "3", "--steps", "40"]
     precision.main(options)
     exact, rounded = (
         json.loads((tmp_path / f"Pendulum-v1_{dtype}_seed3.json").read_text()) for dtype in precision_runs.DTYPES
     )
-    assert (exact["steps"], exact["seed"], len(exact["returns"])) == (10_001, 3, 2)
+    assert (exact["steps"], exact["gradient_steps"], exact["seed"], len(exact["returns"])) == (40, 36, 3, 2)
     assert set(exact["overlaps"]) == {"critic", "target critic"}
-    # Elites at random would share 6 of 64: a critic of one gradient step is nearly flat
+    # Elites at random would share 6 of 64: a critic of few gradient steps is nearly flat
     assert all(0.1 < share <= 1.0 for shares in exact["overlaps"].values() for share in shares)
     assert "overlaps" not in rounded
     assert exact["command"].startswith("python -m benchmark.precision --folder")
+
+
+@pytest.mark.parametrize(
+    ("steps", "expected"), [(20_000, {}), (19_999, {"learning_starts": 1_999}), (300, {"learning_starts": 30})]
+)
+def test_runs_that_would_be_mostly_random_learn(steps, expected, capsys):
+    """Longer ones keep the random steps of the YAML file, which the records of this repository have."""
+    assert precision_runs.shortened("Reacher-v5", steps) == {"n_timesteps": steps, **expected}
+    assert ("are random, in place of 10,000" in capsys.readouterr().out) == bool(expected)

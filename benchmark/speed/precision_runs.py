@@ -12,6 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from benchmark.common.files import file_name, write_json
 from benchmark.common.provenance import conditions
 from benchmark.common.records import EVALUATION_SEED
+from benchmark.common.zoo import read_entry, shortened_warm_up
 from benchmark.speed.elites import critic_overlaps
 from benchmark.speed.training import train_by_zoo
 
@@ -30,7 +31,7 @@ def run(env_id: str, dtype: str, seed: int, args: argparse.Namespace, argv: Sequ
     :param argv: its arguments, for the record
     :return: the record
     """
-    hyperparams = {"cem_dtype": dtype} | ({} if args.steps is None else {"n_timesteps": args.steps})
+    hyperparams = {"cem_dtype": dtype} | ({} if args.steps is None else shortened(env_id, args.steps))
     model = train_by_zoo(env_id, hyperparams, seed, args.device)
     env = make_vec_env(env_id, seed=EVALUATION_SEED)
     returns, _ = evaluate_policy(model, env, EPISODES, return_episode_rewards=True)
@@ -40,12 +41,29 @@ def run(env_id: str, dtype: str, seed: int, args: argparse.Namespace, argv: Sequ
         "dtype": dtype,
         "seed": seed,
         "steps": model.num_timesteps,
+        "gradient_steps": model._n_updates,
         "returns": returns,
     }
     if dtype == "float32":
         networks = {"critic": model.critic, "target critic": model.critic_target}
         record["overlaps"] = {name: critic_overlaps(model, network) for name, network in networks.items()}
     return record
+
+
+def shortened(env_id: str, steps: int) -> dict[str, int]:
+    """
+    Return the hyperparameters of a run of another length than the YAML file's.
+
+    :param env_id: the environment
+    :param steps: environment steps
+    :return: the length; where more than half of the steps would be random, also ``learning_starts``, for a tenth of them
+    """
+    entry = read_entry("cgp", env_id)
+    mostly_random = 2 * entry.get("learning_starts", 0) > steps
+    warm_up = shortened_warm_up("cgp", entry, steps) if mostly_random else {}
+    if warm_up:
+        print(f"Of the {steps:,} steps, {warm_up['learning_starts']:,} are random, in place of {entry['learning_starts']:,}")
+    return {"n_timesteps": steps, **warm_up}
 
 
 def read_records(folder: Path) -> list[dict[str, Any]]:

@@ -10,6 +10,7 @@ from rl_zoo3.exp_manager import ExperimentManager
 from benchmark.common.zoo import silence
 from sb3_cgp import CGP
 from sb3_cgp.zoo.registration import register
+from sb3_cgp.zoo.run_folders import release_run
 
 
 def train_by_zoo(env_id: str, hyperparams: dict[str, Any], seed: int, device: th.device | str = "auto") -> CGP:
@@ -38,5 +39,7 @@ def train_by_zoo(env_id: str, hyperparams: dict[str, Any], seed: int, device: th
         )
         model, _ = manager.setup_experiment()  # type: ignore[misc]
         manager.learn(model)
+        # rl_zoo3 saves the model then, which releases the folder
+        release_run(manager.save_path)
     assert isinstance(model, CGP)
     return model

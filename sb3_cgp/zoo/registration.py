@@ -94,8 +94,6 @@ def register_default_config() -> None:
     def create_callbacks_with_folder(self: Any) -> None:
         # Optuna's trials create their own callbacks, which save no states
         if not self.optimize_hyperparameters:
-            if self.algo == ALGO:
-                hold_run(self.save_path)
             prepare_checkpoints(self)
         create_callbacks(self)
         # After an error, rl_zoo3 ends the first callback, which it takes for the progress bar
@@ -113,6 +111,8 @@ def hold_folders() -> None:
 
     @functools.wraps(learn)
     def learn_and_release(self: Any, model: Any) -> None:
+        if self.algo == ALGO:
+            hold_run(self.save_path)
         try:
             learn(self, model)
         except BaseException:
