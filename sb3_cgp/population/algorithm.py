@@ -118,7 +118,7 @@ class Population(ResumableAlgorithm, PopulationTraining):
         names = ("learning_starts", "policy_delay", "target_update_interval")
         self._counts = {name: np.array([getattr(agent, name) for agent in agents]) for name in names}
         self._recorded = {}
-        self._unlogged = ()
+        self._unlogged = {}
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
