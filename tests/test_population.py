@@ -531,6 +531,21 @@ def test_offline_training_trains_each_agents_actor_at_the_end(monkeypatch):
         assert errors[0] < 0.85 * errors[1]
 
 
+def test_an_agent_that_fails_in_offline_training_does_not_stop_the_others(monkeypatch):
+    def train_policy(agent):
+        if agent.seed == 0:
+            raise ValueError("The actor loss is nan.")
+        agent.actor.mu[0].weight.data.fill_(3.0)
+        return agent
+
+    monkeypatch.setattr(CGP, "train_policy", train_policy)
+    with pytest.warns(UserWarning, match="Agent 0 has failed. The actor loss is nan. The other agents go on."):
+        population = make(2, policy_training="offline").learn(2 * 25)
+    assert population.failed == {0: "The actor loss is nan."}
+    assert [agent.policy.inference for agent in population] == ["cem", "actor"]
+    assert (population[1].actor.mu[0].weight == 3.0).all()
+
+
 # --- Saving, resuming, evaluating ---
 
 

@@ -153,15 +153,16 @@ class PopulationTraining(
         for name, steps in zip(("critic", "actor"), self.policy.failed_at.tolist(), strict=True):
             for index, step in enumerate(steps):
                 if step >= 0 and self._failures[index] is None:
-                    self._failures[index] = f"The {name} loss was NaN or infinite at gradient step {step}."
                     self._agent_updates[index] = step
-                    warnings.warn(
-                        f"Agent {index} has failed. {self._failures[index]} Its {name} is as before that step, and stays so. "
-                        "The other agents go on.",
-                        stacklevel=2,
-                    )
+                    reason = f"The {name} loss was NaN or infinite at gradient step {step}. The {name} is as before that step."
+                    self._note_failure(index, reason)
         if None not in self._failures:
             raise ValueError(f"All agents have failed, the last one for this reason: {self._failures[-1]}")
+
+    def _note_failure(self, index: int, reason: str) -> None:
+        """Note why an agent has failed, and warn of it."""
+        self._failures[index] = reason
+        warnings.warn(f"Agent {index} has failed. {reason} The other agents go on.", stacklevel=2)
 
     def _record_losses(self) -> None:
         """Log the means of the last losses over the agents that learn."""
