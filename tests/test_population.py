@@ -256,6 +256,15 @@ def test_agents_differ_and_each_begins_as_its_seed_says():
     assert th.equal(population[-1].actor.mu[0].weight, weights[2])
 
 
+def test_gradient_steps_follow_the_steps_of_one_environment():
+    population = make(2, train_freq=(3, "step"), gradient_steps=-1).learn(2 * 38)
+    # Rollouts of three steps, the seventh of which ends beyond the warm-up
+    assert population.num_timesteps == 2 * 39
+    assert list(population._agent_updates) == [3 * 7, 3 * 7]
+    alone = CGP("MlpPolicy", Pushed(), **population.agents[0], device="cpu").learn(38)
+    assert alone._n_updates == 21
+
+
 # --- Adam ---
 
 
