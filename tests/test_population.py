@@ -4,6 +4,7 @@ import functools
 import itertools
 import math
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -253,6 +254,15 @@ def test_agents_differ_and_each_begins_as_its_seed_says():
     with pytest.raises(IndexError):
         population[3]
     assert th.equal(population[-1].actor.mu[0].weight, weights[2])
+
+
+def test_gradient_steps_follow_the_steps_of_one_environment():
+    population = make(2, train_freq=(3, "step"), gradient_steps=-1).learn(2 * 38)
+    # Rollouts of three steps, the seventh of which ends beyond the warm-up
+    assert population.num_timesteps == 2 * 39
+    assert list(population._agent_updates) == [3 * 7, 3 * 7]
+    alone = CGP("MlpPolicy", Pushed(), **population.agents[0], device="cpu").learn(38)
+    assert alone._n_updates == 21
 
 
 # --- Adam ---
@@ -530,6 +540,21 @@ def test_offline_training_trains_each_agents_actor_at_the_end(monkeypatch):
         assert errors[0] < 0.85 * errors[1]
 
 
+def test_an_agent_that_fails_in_offline_training_does_not_stop_the_others(monkeypatch):
+    def train_policy(agent):
+        if agent.seed == 0:
+            raise ValueError("The actor loss is nan.")
+        agent.actor.mu[0].weight.data.fill_(3.0)
+        return agent
+
+    monkeypatch.setattr(CGP, "train_policy", train_policy)
+    with pytest.warns(UserWarning, match="Agent 0 has failed. The actor loss is nan. The other agents go on."):
+        population = make(2, policy_training="offline").learn(2 * 25)
+    assert population.failed == {0: "The actor loss is nan."}
+    assert [agent.policy.inference for agent in population] == ["cem", "actor"]
+    assert (population[1].actor.mu[0].weight == 3.0).all()
+
+
 # --- Saving, resuming, evaluating ---
 
 
@@ -573,6 +598,7 @@ class Stop(BaseCallback):
         return self.num_timesteps < self.at
 
 
+@pytest.mark.filterwarnings("ignore:A test_population.Stop was among the callbacks")
 @pytest.mark.parametrize("variant", ["CGP", "TD3"])
 def test_a_population_resumes_as_if_it_had_not_stopped(variant, tmp_path):
     noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), 0.3 * np.ones(1))
@@ -616,7 +642,7 @@ def test_all_agents_are_evaluated_at_once(tmp_path):
 def test_sb3s_callbacks_and_log_take_a_population(tmp_path):
     evaluation = EvalCallback(make_env(2), eval_freq=10, n_eval_episodes=4, verbose=0, warn=False)
     checkpoints = CheckpointCallback(20, tmp_path)
-    population, log = make(2), Log()
+    population, log = make(2, policy_delay=5), Log()
     population.set_logger(Logger(None, [log]))
     population.learn(2 * 45, callback=[evaluation, checkpoints], log_interval=2)
     assert np.isfinite(evaluation.last_mean_reward)
@@ -655,6 +681,24 @@ def test_recorded_gradient_steps_are_the_ordinary_ones(variant, monkeypatch):
     assert not any(each._stays_eager for each in recorded._recorded.values())
     for name, value in ordinary.policy.state_dict().items():
         assert th.equal(recorded.policy.state_dict()[name], value), name
+
+
+@pytest.mark.usefixtures("gpu")
+@pytest.mark.parametrize("variant", ["CGP", "QGP", "CGP-Light", "MPPI from the actor", "TD3", "CEM", "n-step"])
+def test_on_a_gpu_gradient_steps_are_recorded_and_compute_the_same(variant):
+    with warnings.catch_warnings():
+        # Such as one that the host synchronizes
+        warnings.simplefilter("error", UserWarning)
+        recorded, ordinary = (
+            make(AGENTS, device="cuda", cuda_graphs=cuda_graphs, **VARIANTS[variant]).learn(3 * 80)
+            for cuda_graphs in (True, False)
+        )
+    assert any(each._recording is not None for each in recorded._recorded.values())
+    assert not any(each._stays_eager for each in recorded._recorded.values())
+    assert ordinary._recorded == {}
+    for index, agent in enumerate(recorded):
+        for name, value in ordinary[index].policy.state_dict().items():
+            th.testing.assert_close(agent.policy.state_dict()[name], value, rtol=1e-3, atol=1e-3, msg=name)
 
 
 def test_the_selector_is_unchanged():

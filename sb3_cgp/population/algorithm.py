@@ -2,7 +2,7 @@
 
 import io
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -12,7 +12,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_cgp.algorithm import CGP
-from sb3_cgp.common.random_state import preserved_random_state
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import as_schedule
 from sb3_cgp.core.policies import CGPPolicy
@@ -27,15 +26,14 @@ from sb3_cgp.population.agents import (
     merge_arguments,
 )
 from sb3_cgp.population.gradient_step import AgentNumbers
+from sb3_cgp.population.members import PopulationMembers
 from sb3_cgp.population.policies import PopulationPolicy
-from sb3_cgp.population.replay import copied_column
-from sb3_cgp.population.training import PopulationTraining
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
 
 SelfPopulation = TypeVar("SelfPopulation", bound="Population")
 
 
-class Population(ResumableAlgorithm, PopulationTraining):
+class Population(ResumableAlgorithm, PopulationMembers):
     """
     N agents of CGP that are trained in lockstep, each in its own environment.
 
@@ -70,8 +68,6 @@ class Population(ResumableAlgorithm, PopulationTraining):
         self.cuda_graphs = self.agents[0].get("cuda_graphs", True)
         self._failures: list[str | None] = [None] * len(self.agents)
         self._agent_updates = np.zeros(len(self.agents), dtype=np.int64)
-        # Whether the actors have been trained offline
-        self._policy_is_trained = False
         first = self.agents[0]
         super().__init__(
             policy,
@@ -118,7 +114,7 @@ class Population(ResumableAlgorithm, PopulationTraining):
         names = ("learning_starts", "policy_delay", "target_update_interval")
         self._counts = {name: np.array([getattr(agent, name) for agent in agents]) for name in names}
         self._recorded = {}
-        self._unlogged = ()
+        self._unlogged = {}
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
@@ -148,12 +144,6 @@ class Population(ResumableAlgorithm, PopulationTraining):
         allowed = "without VecNormalize, whose statistics all agents would share"
         require(self._vec_normalize_env is None, "env", self.env, allowed)
 
-    def _choose_inference(self) -> None:
-        """Let ``predict`` use the network that the user chose, or the selector while no actor is trained."""
-        has_actor = self._trains_online or (self._policy_loss is not None and self._policy_is_trained)
-        self.policy.inference = (self.agents[0].get("inference") or "actor") if has_actor else "cem"
-        self.policy.actor_proposes = has_actor
-
     def learn(
         self: SelfPopulation,
         total_timesteps: int,
@@ -177,68 +167,11 @@ class Population(ResumableAlgorithm, PopulationTraining):
         """
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         self._report_failures()
-        if self._policy_loss is not None and not self._trains_online and self._agent_updates.any():
+        # A loaded population has no transitions if a callback stopped `learn` at its first step
+        has_data = self.replay_buffer is not None and self.replay_buffer.size() > 0 and self._agent_updates.any()
+        if self._policy_loss is not None and not self._trains_online and has_data:
             self._train_policies()
         return self
-
-    def _train_policies(self) -> None:
-        """Train the actors offline, each by its own CGP."""
-        for index in set(range(len(self))) - set(self.failed):
-            agent = self._make_agent(index)
-            assert self.replay_buffer is not None
-            agent.replay_buffer = copied_column(self.replay_buffer, index)
-            agent.set_logger(self.logger)
-            self.policy.copy_actor_from(agent.train_policy(), index)
-        self._policy_is_trained = True
-        self._choose_inference()
-
-    def __len__(self) -> int:
-        return len(self.agents)
-
-    def __iter__(self) -> Iterator[CGP]:
-        return map(self.__getitem__, range(len(self)))
-
-    def __getitem__(self, index: int) -> CGP:
-        """
-        Return a copy of an agent as an ordinary CGP, which predicts, saves, loads and exports, without an environment.
-
-        :param index: the agent's index
-        :return: the agent
-        :raises IndexError: if there is no such agent
-        """
-        return self.agent(index)
-
-    def agent(self, index: int, env: GymEnv | None = None) -> CGP:
-        """
-        Return a copy of an agent as an ordinary CGP.
-
-        :param index: the agent's index
-        :param env: an environment to go on training in by ``learn(..., reset_num_timesteps=False)``. The agent then also has a
-            copy of its transitions.
-        :return: the agent
-        :raises IndexError: if there is no such agent
-        """
-        index = range(len(self))[index]
-        agent = self._make_agent(index)
-        if env is not None:
-            agent.set_env(env)
-            if self.replay_buffer is not None:
-                agent.replay_buffer = copied_column(self.replay_buffer, index)
-        return agent
-
-    def _make_agent(self, index: int) -> CGP:
-        spaces = self.observation_space, self.action_space
-        with preserved_random_state(self.device):
-            agent = make_agent(self.policy_class, self.agents[index], *spaces, self.device)  # type: ignore[arg-type]
-        self.policy.copy_to(agent, index)
-        agent.num_timesteps = self.num_timesteps // len(self)
-        agent._n_updates = int(self._agent_updates[index])
-        agent._current_progress_remaining = self._current_progress_remaining
-        is_online = self._trains_online and agent._n_updates >= agent.policy_delay
-        agent._policy_is_trained = self._policy_is_trained or is_online
-        agent._policy_is_due = not self._trains_online and not self._policy_is_trained and agent._n_updates > 0
-        agent._choose_inference()
-        return agent
 
     @classmethod
     def load(

@@ -56,10 +56,10 @@ class PopulationTraining(
     _numbers: AgentNumbers
     # Arguments that count steps, by their names, (N,)
     _counts: dict[str, np.ndarray]
-    # CUDA graphs by (some agent trains its actor, some agent moves its averages)
-    _recorded: dict[tuple[bool, bool], RecordedFunction]
-    # The results of the last gradient step
-    _unlogged: Tensors
+    # CUDA graphs by what is fixed when they are recorded, which includes what some agent is due to do
+    _recorded: dict[tuple[Any, ...], RecordedFunction]
+    # The last results of gradient steps by their keys in the log, (N,), until they are logged
+    _unlogged: dict[str, th.Tensor]
 
     @property
     def _policy_loss(self) -> str | None:
@@ -118,7 +118,9 @@ class PopulationTraining(
             due = th.from_numpy(np.stack([self._agent_updates, learns, trains_actor, moves_averages]))
             batch = sample_columns(self.replay_buffer, batch_size, self._numbers.gammas)
             inputs = (*batch, due.to(self.device, non_blocking=True))
-            self._unlogged = self._carry_out((bool(trains_actor.any()), bool(moves_averages.any())), inputs)
+            results = self._carry_out((bool(trains_actor.any()), bool(moves_averages.any())), inputs)
+            # Without an actor that is due, there is no new loss of the actors
+            self._unlogged |= {name: losses for name, losses in zip(LOSSES, results, strict=True) if losses is not None}
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         interval = CHECK_INTERVAL if self.device.type == "cuda" else 1
         if self._n_updates // interval > n_updates_before // interval:
@@ -137,9 +139,10 @@ class PopulationTraining(
         step = GradientStep(self.policy, self._numbers, self._policy_loss, *due)
         if not (self.cuda_graphs and has_cuda_graphs(self.device)):
             return step(*inputs)
-        if due not in self._recorded:
-            self._recorded[due] = RecordedFunction(lambda: [*self.policy.parameters(), *self.policy.buffers()])
-        return self._recorded[due](step, *inputs)
+        fixed = (*due, repr(self.policy.selector), self.policy.actor_proposes)
+        if fixed not in self._recorded:
+            self._recorded[fixed] = RecordedFunction(lambda: [*self.policy.parameters(), *self.policy.buffers()])
+        return self._recorded[fixed](step, *inputs)
 
     def _report_failures(self) -> None:
         """
@@ -150,25 +153,26 @@ class PopulationTraining(
         for name, steps in zip(("critic", "actor"), self.policy.failed_at.tolist(), strict=True):
             for index, step in enumerate(steps):
                 if step >= 0 and self._failures[index] is None:
-                    self._failures[index] = f"The {name} loss was NaN or infinite at gradient step {step}."
                     self._agent_updates[index] = step
-                    warnings.warn(
-                        f"Agent {index} has failed. {self._failures[index]} Its {name} is as before that step, and stays so. "
-                        "The other agents go on.",
-                        stacklevel=2,
-                    )
+                    reason = f"The {name} loss was NaN or infinite at gradient step {step}. The {name} is as before that step."
+                    self._note_failure(index, reason)
         if None not in self._failures:
             raise ValueError(f"All agents have failed, the last one for this reason: {self._failures[-1]}")
+
+    def _note_failure(self, index: int, reason: str) -> None:
+        """Note why an agent has failed, and warn of it."""
+        self._failures[index] = reason
+        warnings.warn(f"Agent {index} has failed. {reason} The other agents go on.", stacklevel=2)
 
     def _record_losses(self) -> None:
         """Log the means of the last losses over the agents that learn."""
         counts = self._agent_updates > 0
         counts &= np.array([failure is None for failure in self._failures])
-        for name, values in zip(LOSSES, self._unlogged, strict=False):
-            if values is not None and counts.any():
-                self.logger.record(f"train/{name}", float(np.mean(values.numpy(force=True)[counts])))
+        for name, values in self._unlogged.items():
+            if counts.any():
+                self.logger.record(f"train/{name}", float(values.numpy(force=True)[counts].mean()))
         self.logger.record("train/failed_agents", len(self.failed))
-        self._unlogged = ()
+        self._unlogged = {}
 
     def dump_logs(self) -> None:
         """Write log data."""

@@ -1,0 +1,87 @@
+"""The agents of a population as ordinary CGPs."""
+
+from collections.abc import Iterator
+
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_cgp.algorithm import CGP
+from sb3_cgp.common.random_state import preserved_random_state
+from sb3_cgp.population.agents import make_agent
+from sb3_cgp.population.replay import copied_column
+from sb3_cgp.population.training import PopulationTraining
+
+
+class PopulationMembers(PopulationTraining):
+    """The part of :class:`~sb3_cgp.population.algorithm.Population` that copies its agents into CGPs, and back."""
+
+    # Whether the actors have been trained offline
+    _policy_is_trained: bool = False
+
+    def _choose_inference(self) -> None:
+        """Let ``predict`` use the network that the user chose, or the selector while no actor is trained."""
+        has_actor = self._trains_online or (self._policy_loss is not None and self._policy_is_trained)
+        self.policy.inference = (self.agents[0].get("inference") or "actor") if has_actor else "cem"
+        self.policy.actor_proposes = has_actor
+
+    def __len__(self) -> int:
+        return len(self.agents)
+
+    def __iter__(self) -> Iterator[CGP]:
+        return map(self.__getitem__, range(len(self)))
+
+    def __getitem__(self, index: int) -> CGP:
+        """
+        Return a copy of an agent as an ordinary CGP, which predicts, saves, loads and exports, without an environment.
+
+        :param index: the agent's index
+        :return: the agent
+        :raises IndexError: if there is no such agent
+        """
+        return self.agent(index)
+
+    def agent(self, index: int, env: GymEnv | None = None) -> CGP:
+        """
+        Return a copy of an agent as an ordinary CGP.
+
+        :param index: the agent's index
+        :param env: an environment to go on training in by ``learn(..., reset_num_timesteps=False)``. The agent then also has a
+            copy of its transitions.
+        :return: the agent
+        :raises IndexError: if there is no such agent
+        """
+        index = range(len(self))[index]
+        agent = self._make_agent(index)
+        if env is not None:
+            agent.set_env(env)
+            if self.replay_buffer is not None:
+                agent.replay_buffer = copied_column(self.replay_buffer, index)
+        return agent
+
+    def _make_agent(self, index: int) -> CGP:
+        spaces = self.observation_space, self.action_space
+        with preserved_random_state(self.device):
+            agent = make_agent(self.policy_class, self.agents[index], *spaces, self.device)  # type: ignore[arg-type]
+        self.policy.copy_to(agent, index)
+        agent.num_timesteps = self.num_timesteps // len(self)
+        agent._n_updates = int(self._agent_updates[index])
+        agent._current_progress_remaining = self._current_progress_remaining
+        is_online = self._trains_online and agent._n_updates >= agent.policy_delay
+        agent._policy_is_trained = is_online or (self._policy_is_trained and index not in self.failed)
+        agent._policy_is_due = not self._trains_online and not self._policy_is_trained and agent._n_updates > 0
+        agent._choose_inference()
+        return agent
+
+    def _train_policies(self) -> None:
+        """Train the actors offline, each by its own CGP."""
+        for index in sorted(set(range(len(self))) - set(self.failed)):
+            agent = self._make_agent(index)
+            assert self.replay_buffer is not None
+            agent.replay_buffer = copied_column(self.replay_buffer, index)
+            agent.set_logger(self.logger)
+            try:
+                self.policy.copy_actor_from(agent.train_policy(), index)
+            except ValueError as error:
+                # Of a loss that is NaN or infinite
+                self._note_failure(index, str(error))
+        self._policy_is_trained = True
+        self._choose_inference()
