@@ -15,7 +15,7 @@ include_patterns = ["README.md", "CHANGELOG.md", "docs/**", "benchmark/results/*
 exclude_patterns = [".*", "build", "dist", "logs", "venv"]
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton"]
-myst_enable_extensions = ["colon_fence", "deflist", "fieldlist"]
+myst_enable_extensions = ["deflist"]
 # Links to headings, as GitHub has them
 myst_heading_anchors = 3
 
@@ -32,7 +32,6 @@ html_css_files = ["site.css"]
 html_additional_pages = {"index": "redirect.html"}
 templates_path = ["templates"]
 html_copy_source = False
-html_theme_options = {"source_directory": "docs/"}
 pygments_style, pygments_dark_style = "tango", "monokai"
 
 
