@@ -29,6 +29,7 @@ VARIANTS = {
     "QGP-Online": dict(policy_loss="qgp"),
     "QGP-Offline": dict(policy_loss="qgp", policy_training="offline"),
     "CEM": dict(policy_loss=None),
+    "CGP-Light": dict(cem_start="actor", cem_iterations=1),
 }
 
 

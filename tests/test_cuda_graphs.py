@@ -39,6 +39,8 @@ VARIANTS = {
     "CGP-Offline": dict(policy_training="offline"),
     "QGP-Online": dict(policy_loss="qgp"),
     "CEM": dict(policy_loss=None),
+    "CGP-Light": dict(cem_start="actor", cem_iterations=1),
+    "from the actor, offline": dict(cem_start="actor", policy_training="offline"),
     "delays": dict(policy_delay=3, target_update_interval=4),
     "n-step": dict(n_steps=3),
     "schedules": dict(

@@ -39,7 +39,8 @@ def test_the_papers_sweeps_have_each_run_once(name):
 
 def test_the_papers_sweeps_are_as_many_runs_as_it_has_combinations():
     assert {name: len(load_sweep(name).runs()) for name in PAPER} == {
-        "e1": 9 * 5 * 4,
+        # With CGP-Light, which the paper does not have
+        "e1": 10 * 5 * 4,
         "e3": 4 * 2 * 3 * 4,
         "e4": 3 * 4 * 4,
         "e5": 4 * 4 * 4,

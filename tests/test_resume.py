@@ -107,6 +107,8 @@ CASES = {
     "CEM": dict(policy_loss=None),
     "CGP-Offline": dict(policy_training="offline"),
     "QGP-Offline": dict(policy_loss="qgp", policy_training="offline"),
+    "CGP-Light": dict(cem_start="actor", cem_iterations=1),
+    "from the actor, offline": dict(cem_start="actor", policy_training="offline"),
     "averaged actor, delays": dict(inference="averaged_actor", policy_delay=3, target_update_interval=4),
     "n-step": dict(n_steps=3),
     "VecNormalize": dict(normalises=True),

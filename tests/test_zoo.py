@@ -133,6 +133,17 @@ def test_the_default_entry_is_the_default_of_cgp():
     assert entry == {name: defaults[name] for name in entry}
 
 
+def test_the_light_entry_is_the_default_but_for_cem():
+    entries = yaml.safe_load((zoo.hyperparams_folder() / "cgp_light.yml").read_text())
+    assert entries == {"default": ENTRIES["default"] | dict(cem_start="actor", cem_iterations=1, cem_samples=16)}
+
+
+def test_a_run_takes_the_light_entry(tmp_path):
+    zoo.register()
+    model, _ = manager(tmp_path, config=str(zoo.hyperparams_folder() / "cgp_light.yml"), hyperparams=TINY).setup_experiment()
+    assert repr(model.policy.selector).startswith("ActorCEM(iterations=1, samples=16, elites=6")
+
+
 def test_every_task_has_its_entry_and_the_papers_tasks_its_configuration():
     assert set(ENTRIES) == {"default"} | PAPER_TASKS | OTHER_TASKS
     for task in PAPER_TASKS:
@@ -252,15 +263,17 @@ def test_converter_rebuilds_what_the_sampler_returned(n_actions):
         sampled = zoo.sample_cgp_params(FixedTrial(parameters), n_actions, 1, NO_HER)
         # As `--trial-id` does; rl_zoo3 makes the noise from its type and standard deviation.
         converted = zoo.convert_cgp_params(parameters)
-        seen.add((parameters["noise_type"], converted["policy_loss"], converted["policy_training"], converted["cem_result"]))
+        start = parameters["cem_start"] if converted["policy_loss"] else "prior"
+        assert converted["cem_start"] == start
+        seen.add((parameters["noise_type"], converted["policy_loss"], converted["policy_training"], start))
         converted = ExperimentManager._preprocess_action_noise(rl_zoo3_manager, converted, {}, env)
 
         noise, rebuilt_noise = sampled.pop("action_noise"), converted.pop("action_noise")
         assert repr(noise) == repr(rebuilt_noise)
         assert noise().shape == (n_actions,)
         assert sampled == converted
-    # Every noise, variant and result of CEM was among them.
-    assert len(seen) == 3 * 5 * 2
+    # Every noise, variant and start of CEM was among them.
+    assert len(seen) == 3 * (4 * 2 + 1)
 
 
 def test_no_noise_takes_back_the_noise_of_a_yaml_entry(tmp_path):

@@ -38,9 +38,10 @@ class SelectorAlgorithm(CGP):
         takes_proposals = getattr(self.policy.selector, "takes_proposals", False)
         allowed = "a subclass of sb3_cgp.CGPPolicy, whose actor can propose actions to the selector"
         require(isinstance(self.policy, CGPPolicy) or not takes_proposals, "policy", self.policy_class, allowed)
-        imitates_itself = isinstance(self.policy.selector, ActorOnly) and self.policy_loss == "cgp"
-        allowed = "'qgp' with the selector ActorOnly(), whose actions are the actor's own"
-        require(not imitates_itself, "policy_loss", self.policy_loss, allowed)
+        if isinstance(self.policy.selector, ActorOnly):
+            reason = "with the selector ActorOnly(), whose actions are the actor's own"
+            require(self.policy_loss == "qgp", "policy_loss", self.policy_loss, f"'qgp' {reason}")
+            require(self._trains_online, "policy_training", self.policy_training, f"'online' {reason}")
 
     def _make_selector(self) -> ActionSelector:
         if self.cem_start == "prior":

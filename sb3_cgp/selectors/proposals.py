@@ -73,10 +73,10 @@ class ActorStart:
         n_around = min(round(self.fraction * samples.shape[1]), samples.shape[1] - n_proposals)
         centres = proposals.clamp(-SATURATION, SATURATION).atanh()
         samples[:, :n_proposals] = centres
-        if n_around > 0:
-            # Each proposal in turn
-            repeated = centres.repeat(1, -(-n_around // n_proposals), 1)[:, :n_around]
-            samples[:, n_proposals : n_proposals + n_around].mul_(self.std).add_(repeated)
+        if n_proposals > 1:
+            # Each of them in turn; one alone is broadcast
+            centres = centres.repeat(1, -(-n_around // n_proposals), 1)[:, :n_around]
+        samples[:, n_proposals : n_proposals + n_around].mul_(self.std).add_(centres)
         actions = samples.tanh()
         actions[:, :n_proposals] = proposals
         return samples, actions

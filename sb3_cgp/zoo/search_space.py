@@ -14,8 +14,8 @@ VARIANTS: dict[str, dict[str, str | None]] = {
     "cgp-offline": {"policy_loss": "cgp", "policy_training": "offline"},
     "qgp-online": {"policy_loss": "qgp", "policy_training": "online"},
     "qgp-offline": {"policy_loss": "qgp", "policy_training": "offline"},
-    # Overrides an `inference` of the YAML entry, whose actor would not exist
-    "cem": {"policy_loss": None, "policy_training": "online", "inference": "cem"},
+    # Overrides an `inference` of the YAML entry, and a start from the actor, which would not exist
+    "cem": {"policy_loss": None, "policy_training": "online", "inference": "cem", "cem_start": "prior"},
 }
 
 
@@ -57,6 +57,9 @@ def sample_cgp_params(trial: "optuna.Trial", n_actions: int, n_envs: int, additi
     trial.suggest_int("cem_samples_pow", 4, 7)
     trial.suggest_float("cem_elite_fraction", 0.02, 0.5, log=True)
     trial.suggest_categorical("cem_result", ["best", "mean"])
+    trial.suggest_categorical("cem_start", ["prior", "actor"])
+    trial.suggest_float("cem_actor_fraction", 0.0, 1.0)
+    trial.suggest_float("cem_actor_std", 0.05, 1.0, log=True)
     trial.suggest_categorical("variant", list(VARIANTS))
 
     if additional_args["using_her_replay_buffer"]:
