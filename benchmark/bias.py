@@ -45,6 +45,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     add("--steps", 15_000, "environment steps of each training")
     add("--learning-starts", 1_500, "random steps at the start")
     add("--units", 64, "units per hidden layer of all networks")
+    add("--batch-size", 128, "transitions of a minibatch")
     add("--interval", 1_500, "environment steps between two measurements")
     add("--episodes", 3, "episodes of each policy per measurement")
     add("--episode-steps", 1_000, "time limit of these episodes")

@@ -263,7 +263,7 @@ def test_score_is_nan_where_one_critic_is():
 
 @pytest.mark.parametrize("name", methods.METHODS)
 def test_methods_are_what_their_names_say(name):
-    model = methods.make_model(name, "Pendulum-v1", units=8, steps=50, learning_starts=10, seed=0, device=th.device("cpu"))
+    model = methods.make_model(name, "Pendulum-v1", units=8, seed=0, device=th.device("cpu"), learning_starts=10)
     model.learn(20)
     assert model._n_updates == 10
     assert model.critic.q_networks[0][0].out_features == 8
@@ -277,7 +277,7 @@ def test_methods_are_what_their_names_say(name):
     assert model.cem_result == ("mean" if name.endswith("mean") else "best")
 
 
-TINY = ["--env", "Pendulum-v1", "--steps", "40", "--learning-starts", "10", "--units", "8"]
+TINY = ["--env", "Pendulum-v1", "--steps", "40", "--learning-starts", "10", "--units", "8", "--batch-size", "8"]
 TINY += ["--interval", "20", "--episodes", "1", "--episode-steps", "460"]
 
 
@@ -330,7 +330,9 @@ def test_page_averages_the_second_half_of_the_training():
             "method": "TD3",
             "seed": seed,
             "gamma": GAMMA,
-            "settings": dict(env="Env-v0", units=8, steps=100, learning_starts=10, episodes=2, episode_steps=460),
+            "settings": dict(
+                env="Env-v0", units=8, batch_size=9, steps=100, learning_starts=10, episodes=2, episode_steps=460
+            ),
             "points": [{"steps": steps, "actor": measured(q1, 10.0)} for steps, q1 in points],
             "command": "python -m benchmark.bias",
             "commit": "abc",

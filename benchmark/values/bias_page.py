@@ -14,7 +14,7 @@ from benchmark.common.provenance import conditions_in_words
 from benchmark.common.style import styles
 from benchmark.common.tables import markdown_table
 from benchmark.values.episodes import TAIL, horizon
-from benchmark.values.methods import BATCH_SIZE, EXPLORATION_NOISE, LEARNING_RATE, MAIN, VARIANTS
+from benchmark.values.methods import EXPLORATION_NOISE, LEARNING_RATE, MAIN, VARIANTS
 
 Point = dict[str, Any]
 
@@ -32,7 +32,7 @@ steps. After a termination no reward follows, so that all states count. Of a tru
 at least {{horizon}} steps follow, as γ^{{horizon}} < {TAIL}. If later rewards are not larger than the largest in the
 episode, the rewards that are cut off change no bias by more than {{error_bound:.2g}}.
 
-All methods: batch size {BATCH_SIZE}, two hidden layers of {{units}} units, learning rate {LEARNING_RATE},
+All methods: batch size {{batch_size}}, two hidden layers of {{units}} units, learning rate {LEARNING_RATE},
 {{learning_starts:,}} random steps. CGP-n: the paper's CEM, with n iterations of 64 samples. CGP-Light:
 `cem_start="actor"`, one iteration of 16 samples. TD3: SB3's, with exploration noise {EXPLORATION_NOISE}. The others are
 variants of CGP-2. floor: the bootstrap value is at least the minimum of the target critics for the averaged actor's

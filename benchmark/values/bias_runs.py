@@ -13,7 +13,7 @@ from benchmark.values.bias import BiasCallback
 from benchmark.values.methods import METHODS, make_model
 
 # The arguments that all records of a folder share, as they are compared
-SETTINGS = ("env", "units", "steps", "learning_starts", "interval", "episodes", "episode_steps")
+SETTINGS = ("env", "units", "batch_size", "steps", "learning_starts", "interval", "episodes", "episode_steps")
 
 
 def run(method: str, seed: int, args: argparse.Namespace, argv: Sequence[str]) -> dict[str, Any]:
@@ -26,7 +26,8 @@ def run(method: str, seed: int, args: argparse.Namespace, argv: Sequence[str]) -
     :param argv: its arguments, for the record
     :return: the record
     """
-    model = make_model(method, args.env, args.units, args.steps, args.learning_starts, seed, args.device)
+    sizes = dict(buffer_size=args.steps, learning_starts=args.learning_starts, batch_size=args.batch_size)
+    model = make_model(method, args.env, args.units, seed, args.device, **sizes)
     record = conditions("benchmark.bias", argv, model.device)
     callback = BiasCallback(args.env, args.interval, args.episodes, args.episode_steps)
     started, processor_started = time.perf_counter(), time.process_time()

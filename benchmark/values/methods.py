@@ -13,7 +13,6 @@ from stable_baselines3.common.noise import NormalActionNoise
 from benchmark.values.variants import ClampedCGP, FlooredCGP, MinScorePolicy
 from sb3_cgp import CGP, CGPPolicy
 
-BATCH_SIZE = 128
 LEARNING_RATE = 1e-3
 # Of TD3, as its authors have it; CGP explores by CEM's own sampling
 EXPLORATION_NOISE = 0.1
@@ -49,37 +48,24 @@ VARIANTS = {
 METHODS = MAIN | VARIANTS
 
 
-def make_model(
-    name: str, env_id: str, units: int, steps: int, learning_starts: int, seed: int, device: th.device
-) -> CGP | TD3:
+def make_model(name: str, env_id: str, units: int, seed: int, device: th.device, **kwargs: Any) -> CGP | TD3:
     """
     Return the untrained model of a method.
 
     :param name: the method
     :param env_id: the environment
     :param units: units of each of the two hidden layers of all networks
-    :param steps: environment steps of the training, the size of the replay buffer
-    :param learning_starts: random steps before the first gradient step
     :param seed: seed of its random numbers
     :param device: device of its networks
+    :param kwargs: further arguments of the algorithm
     :return: the model
     """
     method = METHODS[name]
-    kwargs = dict(method.kwargs)
+    kwargs = kwargs | method.kwargs
     if method.algorithm is TD3:
         kwargs["action_noise"] = _exploration_noise(env_id)
-    return method.algorithm(
-        method.policy,
-        env_id,
-        learning_rate=LEARNING_RATE,
-        buffer_size=steps,
-        learning_starts=learning_starts,
-        batch_size=BATCH_SIZE,
-        policy_kwargs=dict(net_arch=[units, units]),
-        seed=seed,
-        device=str(device),
-        **kwargs,
-    )
+    kwargs |= dict(learning_rate=LEARNING_RATE, policy_kwargs=dict(net_arch=[units, units]), seed=seed, device=str(device))
+    return method.algorithm(method.policy, env_id, **kwargs)
 
 
 def _exploration_noise(env_id: str) -> NormalActionNoise:
