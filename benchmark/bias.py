@@ -21,8 +21,22 @@ from benchmark.values.episodes import horizon
 from benchmark.values.methods import METHODS
 from sb3_cgp.common.files import write_atomically
 
-# Of all methods, SB3's default
-GAMMA = 0.99
+
+def discount(text: str) -> float:
+    """
+    Read a discount factor.
+
+    :param text: the argument
+    :return: the factor
+    :raises argparse.ArgumentTypeError: if it is not above 0 and below 1
+    """
+    try:
+        gamma = float(text)
+    except ValueError:
+        gamma = 0.0
+    if not 0.0 < gamma < 1.0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0 and below 1")
+    return gamma
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -42,19 +56,21 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), help="methods (default: all)")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1], help="seeds of the training (default: 0 and 1)")
-    add("--steps", 15_000, "environment steps of each training")
-    add("--learning-starts", 1_500, "random steps at the start")
+    # The values approach their fixed point by a factor of e in 400 / (1 - γ) gradient steps, with the averages of the default
+    parser.add_argument("--gamma", type=discount, default=0.9, help="discount factor (default: %(default)s)")
+    add("--steps", 8_000, "environment steps of each training")
+    add("--learning-starts", 1_000, "random steps at the start")
     add("--units", 64, "units per hidden layer of all networks")
-    add("--batch-size", 128, "transitions of a minibatch")
-    add("--interval", 1_500, "environment steps between two measurements")
-    add("--episodes", 3, "episodes of each policy per measurement")
+    add("--batch-size", 64, "transitions of a minibatch")
+    add("--interval", 1_000, "environment steps between two measurements")
+    add("--episodes", 2, "episodes of each policy per measurement")
     add("--episode-steps", 1_000, "time limit of these episodes")
     args = parser.parse_args(argv)
     if not isinstance(gym.spec(args.env).make().observation_space, spaces.Box):
         parser.error(f"argument --env: {args.env} must have vectors as observations")
-    if args.episode_steps < horizon(GAMMA):
+    if args.episode_steps < horizon(args.gamma):
         parser.error(
-            f"argument --episode-steps: {args.episode_steps} must be at least {horizon(GAMMA)}, so that a return is known"
+            f"argument --episode-steps: {args.episode_steps} must be at least {horizon(args.gamma)}, so that a return is known"
         )
     try:
         check_settings(args)

@@ -278,7 +278,7 @@ def test_methods_are_what_their_names_say(name):
 
 
 TINY = ["--env", "Pendulum-v1", "--steps", "40", "--learning-starts", "10", "--units", "8", "--batch-size", "8"]
-TINY += ["--interval", "20", "--episodes", "1", "--episode-steps", "460"]
+TINY += ["--gamma", "0.99", "--interval", "20", "--episodes", "1", "--episode-steps", "460"]
 
 
 def test_command_records_runs_as_they_end_and_continues(tmp_path, monkeypatch):
@@ -319,6 +319,13 @@ def test_command_refuses_episodes_too_short_for_a_return(tmp_path, capsys):
     assert "458 must be at least 459" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("gamma", ["1", "0", "nan", "much"])
+def test_command_refuses_a_discount_without_a_horizon(gamma, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        command.main([*TINY, "--folder", str(tmp_path), "--gamma", gamma])
+    assert f"{gamma!r} is not a number above 0 and below 1" in capsys.readouterr().err
+
+
 def test_page_averages_the_second_half_of_the_training():
     def measured(q1, discounted_return):
         more = {"q_min": q1 - 1.0, "return": 50.0, "length": 10.0, "n_states": 10, "error_bound": 0.25}
@@ -329,9 +336,8 @@ def test_page_averages_the_second_half_of_the_training():
         return {
             "method": "TD3",
             "seed": seed,
-            "gamma": GAMMA,
             "settings": dict(
-                env="Env-v0", units=8, batch_size=9, steps=100, learning_starts=10, episodes=2, episode_steps=460
+                env="Env-v0", units=8, batch_size=9, gamma=GAMMA, steps=100, learning_starts=10, episodes=2, episode_steps=460
             ),
             "points": [{"steps": steps, "actor": measured(q1, 10.0)} for steps, q1 in points],
             "command": "python -m benchmark.bias",

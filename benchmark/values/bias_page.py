@@ -32,7 +32,7 @@ steps. After a termination no reward follows, so that all states count. Of a tru
 at least {{horizon}} steps follow, as γ^{{horizon}} < {TAIL}. If later rewards are not larger than the largest in the
 episode, the rewards that are cut off change no bias by more than {{error_bound:.2g}}.
 
-All methods: batch size {{batch_size}}, two hidden layers of {{units}} units, learning rate {LEARNING_RATE},
+All methods: γ = {{gamma}}, batch size {{batch_size}}, two hidden layers of {{units}} units, learning rate {LEARNING_RATE},
 {{learning_starts:,}} random steps. CGP-n: the paper's CEM, with n iterations of 64 samples. CGP-Light:
 `cem_start="actor"`, one iteration of 16 samples. TD3: SB3's, with exploration noise {EXPLORATION_NOISE}. The others are
 variants of CGP-2. floor: the bootstrap value is at least the minimum of the target critics for the averaged actor's
@@ -126,11 +126,11 @@ def markdown(records: list[dict[str, Any]]) -> str:
                 cell(runs, "cem", lambda measured: measured["return"]),
             ]
         )
-    settings, gamma = records[0]["settings"], records[0]["gamma"]
+    settings = records[0]["settings"]
     bounds = [point["actor"]["error_bound"] for record in records for point in late(record)]
     notes = NOTES.format(
         **settings,
-        horizon=horizon(gamma),
+        horizon=horizon(settings["gamma"]),
         n_points=len(late(records[0])),
         error_bound=max((bound for bound in bounds if bound is not None), default=0.0),
     )

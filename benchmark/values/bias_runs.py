@@ -13,7 +13,7 @@ from benchmark.values.bias import BiasCallback
 from benchmark.values.methods import METHODS, make_model
 
 # The arguments that all records of a folder share, as they are compared
-SETTINGS = ("env", "units", "batch_size", "steps", "learning_starts", "interval", "episodes", "episode_steps")
+SETTINGS = ("env", "units", "batch_size", "gamma", "steps", "learning_starts", "interval", "episodes", "episode_steps")
 
 
 def run(method: str, seed: int, args: argparse.Namespace, argv: Sequence[str]) -> dict[str, Any]:
@@ -26,8 +26,8 @@ def run(method: str, seed: int, args: argparse.Namespace, argv: Sequence[str]) -
     :param argv: its arguments, for the record
     :return: the record
     """
-    sizes = dict(buffer_size=args.steps, learning_starts=args.learning_starts, batch_size=args.batch_size)
-    model = make_model(method, args.env, args.units, seed, args.device, **sizes)
+    common = {name: getattr(args, name) for name in ("batch_size", "gamma", "learning_starts")}
+    model = make_model(method, args.env, args.units, seed, args.device, buffer_size=args.steps, **common)
     record = conditions("benchmark.bias", argv, model.device)
     callback = BiasCallback(args.env, args.interval, args.episodes, args.episode_steps)
     started, processor_started = time.perf_counter(), time.process_time()
@@ -36,7 +36,6 @@ def run(method: str, seed: int, args: argparse.Namespace, argv: Sequence[str]) -
         "method": method,
         "seed": seed,
         "settings": settings(args),
-        "gamma": model.gamma,
         "seconds": time.perf_counter() - started,
         "processor_seconds": time.process_time() - processor_started,
         "points": callback.points,
