@@ -119,6 +119,14 @@ def test_states_of_several_episodes_count_alike():
     assert measured["length"] == pytest.approx((2 + 8 + 600) / 3)
 
 
+def test_episodes_begin_in_the_same_states_each_time():
+    envs = [gym.make("Pendulum-v1") for _ in range(2)]
+    first, again = (episodes.play(act, envs, seed=5) for _ in range(2))
+    starts = [each.observations[0].tolist() for each in (*first, *again)]
+    assert starts[:2] == starts[2:]
+    assert starts[0] != starts[1]
+
+
 def test_returns_to_go():
     assert episodes.returns_to_go([1.0, 0.0, 4.0], 0.5).tolist() == [2.0, 2.0, 4.0]
 

@@ -19,21 +19,20 @@ from benchmark.values.methods import EXPLORATION_NOISE, LEARNING_RATE, MAIN, VAR
 Point = dict[str, Any]
 
 NOTES = f"""\
-Bias: the first critic's value of a state and of the action taken in it, less the discounted return that followed,
-averaged over the states of {{episodes}} episodes of the actor, and over the {{n_points}} measurements in the second
-half of {{steps:,}} steps on {{env}}. Shown are the mean over the seeds and the lowest and the highest seed's. "Its
-minimum's": with the minimum of both critics in place of the first critic's value. "Value" and "return that followed"
-are the bias's two terms; "return" is the episodes', not discounted. CEM's: of episodes in which CEM acts by the first
-critic, as it does in the training's rollouts, since CGP's critics learn the values of CEM's actions, not of the
-actor's.
+Bias: the first critic's value Q_1 of a state and of the action taken in it, less the discounted return that followed.
+Averaged over the states of {{episodes}} episodes of the actor, and over the {{n_points}} measurements in the second
+half of {{steps:,}} steps on {{env}}. Shown are the mean over the seeds, and the lowest and the highest seed's. Bias of
+the minimum: with the minimum of both critics in place of Q_1. Return: of the whole episodes, not discounted. CEM: in
+episodes in which CEM acts by the first critic, as it does in the training's rollouts, since CGP's critics learn the
+values of CEM's actions, not of the actor's.
 
 The episodes begin in the same states at each measurement, and a time limit truncates them after {{episode_steps:,}}
 steps. After a termination no reward follows, so that all states count. Of a truncated episode, those states count that
 at least {{horizon}} steps follow, as γ^{{horizon}} < {TAIL}. If later rewards are not larger than the largest in the
 episode, the rewards that are cut off change no bias by more than {{error_bound:.2g}}.
 
-All methods: γ = {{gamma}}, batch size {{batch_size}}, two hidden layers of {{units}} units, learning rate {LEARNING_RATE},
-{{learning_starts:,}} random steps. CGP-n: the paper's CEM, with n iterations of 64 samples. CGP-Light:
+All methods: γ = {{gamma}}, batch size {{batch_size}}, two hidden layers of {{units}} units, learning rate
+{LEARNING_RATE}, {{learning_starts:,}} random steps. CGP-n: the paper's CEM, with n iterations of 64 samples. CGP-Light:
 `cem_start="actor"`, one iteration of 16 samples. TD3: SB3's, with exploration noise {EXPLORATION_NOISE}. The others are
 variants of CGP-2. floor: the bootstrap value is at least the minimum of the target critics for the averaged actor's
 action. clamp: it is clamped to the range of all targets so far, as in TD7. min: CEM ranks actions by the minimum of
@@ -103,12 +102,12 @@ def markdown(records: list[dict[str, Any]]) -> str:
         "method",
         "seeds",
         "bias",
-        "its minimum's",
-        "value",
-        "return that followed",
+        "bias of the minimum",
+        "Q_1",
+        "discounted return",
         "return",
-        "CEM's bias",
-        "CEM's return",
+        "CEM: bias",
+        "CEM: return",
     ]
     rows = []
     for method in methods:
