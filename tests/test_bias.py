@@ -345,7 +345,15 @@ def test_page_averages_the_second_half_of_the_training():
             "method": "TD3",
             "seed": seed,
             "settings": dict(
-                env="Env-v0", units=8, batch_size=9, gamma=GAMMA, steps=100, learning_starts=10, episodes=2, episode_steps=460
+                env="Env-v0",
+                units=8,
+                batch_size=9,
+                gamma=GAMMA,
+                tau=0.5,
+                steps=100,
+                learning_starts=10,
+                episodes=2,
+                episode_steps=460,
             ),
             "points": [{"steps": steps, "actor": measured(q1, 10.0)} for steps, q1 in points],
             "command": "python -m benchmark.bias",

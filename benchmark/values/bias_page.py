@@ -31,7 +31,7 @@ steps. After a termination no reward follows, so that all states count. Of a tru
 at least {{horizon}} steps follow, as γ^{{horizon}} < {TAIL}. If later rewards are not larger than the largest in the
 episode, the rewards that are cut off change no bias by more than {{error_bound:.2g}}.
 
-All methods: γ = {{gamma}}, batch size {{batch_size}}, two hidden layers of {{units}} units, learning rate
+All methods: γ = {{gamma}}, τ = {{tau}}, batch size {{batch_size}}, two hidden layers of {{units}} units, learning rate
 {LEARNING_RATE}, {{learning_starts:,}} random steps. CGP-n: the paper's CEM, with n iterations of 64 samples. CGP-Light:
 `cem_start="actor"`, one iteration of 16 samples. TD3: SB3's, with exploration noise {EXPLORATION_NOISE}. The others are
 variants of CGP-2. floor: the bootstrap value is at least the minimum of the target critics for the averaged actor's

@@ -13,7 +13,7 @@ from benchmark.values.bias import BiasCallback
 from benchmark.values.methods import METHODS, make_model
 
 # The arguments that all records of a folder share, as they are compared
-SETTINGS = ("env", "units", "batch_size", "gamma", "steps", "learning_starts", "interval", "episodes", "episode_steps")
+SETTINGS = ("env", "units", "batch_size", "gamma", "tau", "steps", "learning_starts", "interval", "episodes", "episode_steps")
 
 
 def run(method: str, seed: int, args: argparse.Namespace, argv: Sequence[str]) -> dict[str, Any]:
@@ -26,7 +26,7 @@ def run(method: str, seed: int, args: argparse.Namespace, argv: Sequence[str]) -
     :param argv: its arguments, for the record
     :return: the record
     """
-    common = {name: getattr(args, name) for name in ("batch_size", "gamma", "learning_starts")}
+    common = {name: getattr(args, name) for name in ("batch_size", "gamma", "tau", "learning_starts")}
     model = make_model(method, args.env, args.units, seed, args.device, buffer_size=args.steps, **common)
     record = conditions("benchmark.bias", argv, model.device)
     callback = BiasCallback(args.env, args.interval, args.episodes, args.episode_steps)
