@@ -54,8 +54,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--env", type=continuous_environment, default="Hopper-v5", help="environment (default: %(default)s)")
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), help="methods (default: all)")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1], help="seeds of the training (default: 0 and 1)")
-    # From zero, values need some 2 / (τ (1 - γ)) gradient steps to grow by bootstrapping: 2,000 here, 40,000 with the algorithms'
-    # own γ of 0.99 and τ of 0.005
+    # From zero, values grow by bootstrapping within some 2 / (τ (1 - γ)) gradient steps: 2,000 by these defaults, 40,000 by those
+    # of the algorithms, 0.99 and 0.005
     parser.add_argument("--gamma", type=fraction, default=0.95, help="discount factor (default: %(default)s)")
     parser.add_argument("--tau", type=fraction, default=0.02, help="coefficient of the averages (default: %(default)s)")
     add("--steps", 8_000, "environment steps of each training")
@@ -66,7 +66,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     add("--episodes", 3, "episodes of each policy per measurement")
     add("--episode-steps", 1_000, "time limit of these episodes")
     args = parser.parse_args(argv)
-    if not isinstance(gym.spec(args.env).make().observation_space, spaces.Box):
+    if not isinstance(gym.make(args.env).observation_space, spaces.Box):
         parser.error(f"argument --env: {args.env} must have vectors as observations")
     if args.episode_steps < horizon(args.gamma):
         parser.error(

@@ -334,6 +334,15 @@ def test_command_refuses_a_discount_without_a_horizon(gamma, tmp_path, capsys):
     assert f"{gamma!r} is not a number above 0 and below 1" in capsys.readouterr().err
 
 
+def test_command_refuses_observations_of_several_parts(tmp_path, capsys, monkeypatch):
+    parts = spaces.Dict(x=Counter.observation_space)
+    monkeypatch.setattr(Counter, "observation_space", parts)
+    monkeypatch.setitem(gym.registry, "Parts-v0", gym.envs.registration.EnvSpec("Parts-v0", entry_point=Counter))
+    with pytest.raises(SystemExit):
+        command.main([*TINY, "--folder", str(tmp_path), "--env", "Parts-v0"])
+    assert "Parts-v0 must have vectors as observations" in capsys.readouterr().err
+
+
 def test_page_averages_the_second_half_of_the_training():
     def measured(q1, discounted_return):
         more = {"q_min": q1 - 1.0, "return": 50.0, "length": 10.0, "n_states": 10, "error_bound": 0.25}
