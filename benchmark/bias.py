@@ -54,8 +54,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--env", type=continuous_environment, default="Hopper-v5", help="environment (default: %(default)s)")
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), help="methods (default: all)")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1], help="seeds of the training (default: 0 and 1)")
-    # From zero, values grow by bootstrapping within some 2 / (τ (1 - γ)) gradient steps: 2,000 by these defaults, 40,000 by those
-    # of the algorithms, 0.99 and 0.005
+    # From zero, values grow by bootstrapping within some 2 / (τ (1 - γ)) gradient steps: 2,000 by these defaults, 40,000 by
+    # the algorithms' own, 0.99 and 0.005
     parser.add_argument("--gamma", type=fraction, default=0.95, help="discount factor (default: %(default)s)")
     parser.add_argument("--tau", type=fraction, default=0.02, help="coefficient of the averages (default: %(default)s)")
     add("--steps", 8_000, "environment steps of each training")
