@@ -45,12 +45,13 @@ help: ## list the goals
 	@echo "Every goal that needs Python takes PYTHON=$(PYTHON) (3.10 or newer)."
 
 train: $(INSTALLED) ## install, train with rl_zoo3, evaluate and draw the learning curve
-	@plan=$$($(IN_VENV) -m benchmark.plan --algo $(ALGO) --env $(ENV) --folder "$(LOGS)" $(if $(STEPS),--steps $(STEPS))) && \
+	@plan=$$($(IN_VENV) -m benchmark.plan --algo $(ALGO) --env $(ENV) --folder "$(LOGS)" $(if $(STEPS),--steps $(STEPS)) \
+	  $(if $(PARAMS)$(ARGS),-- $(if $(PARAMS),-params $(PARAMS)) $(ARGS))) && \
 	set -- $$plan && \
 	(set -x; $(IN_VENV) -m rl_zoo3.train --algo $(ALGO) --env $(ENV) --seed $(SEED) --num-threads $(THREADS) \
 	  $(if $(STEPS),--n-timesteps $(STEPS)) \
 	  --eval-freq $(or $(EVAL_FREQ),$$1) --eval-episodes $(EVAL_EPISODES) --log-folder "$(LOGS)" --progress \
-	  $(if $(PARAMS),-params $(PARAMS)) $(ARGS)) && \
+	  $(if $(PARAMS),-params $$3 $(PARAMS),$${3:+-params $$3}) $(ARGS)) && \
 	$(IN_VENV) -m benchmark.report --algo $(ALGO) --env $(ENV) --folder "$(LOGS)" --exp-id $$2
 
 resume: $(INSTALLED) ## continue an interrupted run of CGP to its end, and report: make resume RUN=logs/cgp/Pendulum-v1_1

@@ -2,4 +2,6 @@
 
 from sb3_cgp.common.extras import require_from_extra
 
-require_from_extra("rl_zoo3", "zoo", "The package benchmark")
+# Not all of the others come with rl_zoo3 where that was installed without the extra
+for name in ("rl_zoo3", "matplotlib", "pandas", "rliable", "scipy", "tensorboard"):
+    require_from_extra(name, "zoo", "The package benchmark")

@@ -1,7 +1,9 @@
 """
-Plan a training run for ``make train`` before rl_zoo3 starts: the evaluation interval, and the number of the run.
+Plan a training run for ``make train`` before rl_zoo3 starts: the evaluation interval, the number of the run, and the random
+steps at the start of a shortened run.
 
-``python -m benchmark.plan --algo cgp --env Pendulum-v1`` prints both on one line, as in ``250 1``.
+``python -m benchmark.plan --algo cgp --env Pendulum-v1`` prints them on one line, as in ``1000 1``, or, with ``--steps 5000``,
+as in ``250 1 learning_starts:500``.
 """
 
 import argparse
@@ -15,21 +17,22 @@ from rl_zoo3 import ALGOS, get_latest_run_id
 
 from benchmark.common.arguments import count
 from benchmark.common.environments import import_packages, split_env_id
-from benchmark.common.zoo import read_entry
+from benchmark.common.zoo import read_entry, shortened_warm_up, warm_up_in_words
 
 EVALUATIONS_PER_RUN = 20
 LONGEST_INTERVAL = 10_000
 
 
-def configured_steps(algo: str, env_id: str) -> int:
+def configured_steps(algo: str, env_id: str, conf_file: str | None = None) -> int:
     """
     Return the number of environment steps in the YAML file that rl_zoo3 would read.
 
     :param algo: the algorithm's name in rl_zoo3
     :param env_id: a registered environment
+    :param conf_file: a YAML file; None for the algorithm's own
     :return: the number of environment steps
     """
-    return int(read_entry(algo, env_id)["n_timesteps"])
+    return int(read_entry(algo, env_id, conf_file)["n_timesteps"])
 
 
 def evaluation_interval(steps: int) -> int:
@@ -42,13 +45,14 @@ def evaluation_interval(steps: int) -> int:
     return min(max(steps // EVALUATIONS_PER_RUN, 1), LONGEST_INTERVAL)
 
 
-def planned_interval(algo: str, env_id: str, steps: int | None) -> int:
+def planned_interval(algo: str, env_id: str, steps: int | None, conf_file: str | None = None) -> int:
     """
     Return the evaluation interval of a run that has not started.
 
     :param algo: the algorithm's name in rl_zoo3
     :param env_id: the environment
     :param steps: the number of environment steps; None for that of the YAML file
+    :param conf_file: a YAML file; None for the algorithm's own
     :return: environment steps from one evaluation to the next
     """
     if steps is not None:
@@ -56,7 +60,39 @@ def planned_interval(algo: str, env_id: str, steps: int | None) -> int:
     # rl_zoo3.train suggests the nearest name, or knows the environment from --gym-packages
     if env_id not in gym.registry:
         return LONGEST_INTERVAL
-    return evaluation_interval(configured_steps(algo, env_id))
+    return evaluation_interval(configured_steps(algo, env_id, conf_file))
+
+
+def planned_warm_up(algo: str, env_id: str, steps: int | None, options: argparse.Namespace) -> dict[str, int]:
+    """
+    Return the number of random steps of a run that is shorter than its YAML entry says, as in sweeps.
+
+    :param algo: the algorithm's name in rl_zoo3
+    :param env_id: the environment
+    :param steps: the number of environment steps; None for that of the YAML file
+    :param options: the options of rl_zoo3.train
+    :return: ``learning_starts``; nothing if the user sets it, the run is not shortened, or at most a tenth is random anyway
+    """
+    given = [hyperparameter.partition(":")[0] for hyperparameter in options.hyperparams]
+    if steps is None or env_id not in gym.registry or "learning_starts" in given:
+        return {}
+    entry = read_entry(algo, env_id, options.conf_file)
+    return shortened_warm_up(algo, entry, steps) if steps < int(entry["n_timesteps"]) else {}
+
+
+def train_options(arguments: Sequence[str]) -> argparse.Namespace:
+    """
+    Read those options of rl_zoo3.train that have an influence on the plan.
+
+    :param arguments: the options, as in ``PARAMS`` and ``ARGS`` of ``make train``
+    :return: the options
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("-params", "--hyperparams", nargs="+", default=[])
+    parser.add_argument("-conf", "--conf-file")
+    parser.add_argument("-n", "--n-timesteps", type=int, default=-1)
+    parser.add_argument("--gym-packages", nargs="+", default=[])
+    return parser.parse_known_args(arguments)[0]
 
 
 def next_run_id(folder: str, algo: str, env_id: str) -> int:
@@ -74,7 +110,7 @@ def next_run_id(folder: str, algo: str, env_id: str) -> int:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """
-    Print the evaluation interval and the next run's number.
+    Print the evaluation interval, the next run's number, and the random steps of a shortened run.
 
     :param argv: the command line; None for that of the process
     """
@@ -84,7 +120,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--folder", default="logs", help="rl_zoo3's log folder (default: %(default)s)")
     parser.add_argument("--steps", type=count, help="length of the run (default: that of the YAML file)")
     parser.add_argument("--gym-packages", nargs="+", default=[], help="modules to import, which register environments")
+    parser.add_argument("options", nargs="*", metavar="-- OPTION", help="other options of rl_zoo3.train")
     args = parser.parse_args(argv)
+    options = train_options(args.options)
+    # rl_zoo3 takes a negative number for the YAML file's
+    steps = max(options.n_timesteps, 0) or args.steps
     try:
         modules, env_id = split_env_id(args.env)
         if modules:
@@ -92,10 +132,16 @@ def main(argv: Sequence[str] | None = None) -> None:
             raise ValueError(
                 f'rl_zoo3 does not import modules of ids: train ENV={env_id} with ARGS="--gym-packages {modules[0]}"'
             )
-        import_packages(args.gym_packages)
+        import_packages([*args.gym_packages, *options.gym_packages])
     except (ImportError, ValueError) as error:
         sys.exit(f"Error: {error}")
-    print(planned_interval(args.algo, args.env, args.steps), next_run_id(args.folder, args.algo, args.env))
+    warm_up = planned_warm_up(args.algo, args.env, steps, options)
+    if warm_up:
+        assert steps is not None
+        print(warm_up_in_words(steps, **warm_up, remedy='PARAMS="learning_starts:..."'), file=sys.stderr)
+    interval = planned_interval(args.algo, args.env, steps, options.conf_file)
+    overrides = [f"{name}:{value}" for name, value in warm_up.items()]
+    print(interval, next_run_id(args.folder, args.algo, args.env), *overrides)
 
 
 if __name__ == "__main__":

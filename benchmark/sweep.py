@@ -31,7 +31,9 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m benchmark.sweep", description="Execute a sweep, or continue it.", allow_abbrev=False
     )
-    parser.add_argument("name", help="one of the paper's sweeps, e1 to e8, or the path of a sweep's file")
+    parser.add_argument(
+        "name", help="a sweep of hyperparams/sweeps, such as e1 to e8 of the paper, or the path of a sweep's file"
+    )
     parser.add_argument("--task", nargs="+", help="environments, as in Gymnasium, in place of the file's")
     parser.add_argument("--steps", type=count, help="environment steps of each run, in place of the file's")
     parser.add_argument("--seeds", type=count, help="number of seeds, from 0, in place of the file's")

@@ -17,6 +17,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
 from benchmark.common.arguments import count, hyperparameter
 from benchmark.common.environments import import_packages, registered_environment, split_env_id
+from benchmark.common.zoo import shortened_warm_up, warm_up_in_words
 from benchmark.sweeps.checks import check_tuning
 from benchmark.sweeps.entries import base_entry, write_entry
 from benchmark.sweeps.experiments import study_name
@@ -84,6 +85,11 @@ def tuning_of(args: argparse.Namespace) -> Tuning:
     task = registered_environment(args.env)
     base = base_entry(args.algo, task, args.conf_file)
     steps = args.steps or int(base["n_timesteps"])
+    if steps < int(base["n_timesteps"]):
+        shortened = shortened_warm_up(args.algo, base, steps)
+        base |= shortened
+        if shortened and args.parent is None and "learning_starts" not in dict(args.set):
+            print(warm_up_in_words(steps, **shortened, remedy="--set learning_starts=..."), file=sys.stderr)
     return Tuning(
         algo=args.algo,
         task=task,

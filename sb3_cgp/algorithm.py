@@ -282,14 +282,17 @@ class CGP(
         Write the policy that ``predict`` uses, to be used elsewhere and loaded without pickle.
 
         ``policy.onnx`` takes a batch of observations as the environment returns them (images channels first) and returns
-        actions as the environment takes them; VecNormalize's present statistics are part of it.
+        actions as the environment takes them; VecNormalize's present statistics are part of it. Its input is called
+        ``observation``, or has one input for each key of ``Dict`` observations, called by the key; its output is ``action``.
+        Each input has the data type of its space: float64 observations are given in float64.
         ``policy.safetensors`` and ``policy.json`` are what :meth:`load_weights` reads. Both are evaluated on a few random
         observations, and compared with ``predict``, before any file is written.
 
         :param folder: where to write; it is made if it is missing. An export in it is replaced when all files of the
             new one are on the disk.
         :raises ValueError: if the policy cannot be exported, naming the obstacle and what is allowed: an actor must
-            act, on a ``Box``, by SB3's own features extractors and one of PyTorch's usual activation functions
+            act, on a ``Box`` or a ``Dict`` of them, by SB3's own features extractors and one of PyTorch's usual activation
+            functions
         :raises ImportError: if a package of the ``export`` extra is not installed
         """
         export_policy(self, folder)

@@ -97,7 +97,7 @@ def test_ranks_are_within_a_study(tmp_path: Path) -> None:
 
 
 def test_own_variants_and_random_actions_are_no_rivals(find: Any) -> None:
-    levels = dict(CGP_Online=60, CGP_Offline=90, QGP_Online=80, CEM=85, TD3=50, SAC=40, Random=99)
+    levels = dict(CGP_Online=60, CGP_Offline=90, QGP_Online=80, CGP_Light=95, CEM=85, TD3=50, SAC=40, Random=99)
     found = find("best or second", runs(scores(**levels), [name.replace("_", "-") for name in levels]))
     assert found.verdict == SUPPORTED
     assert "rank 1 of 3" in found.text

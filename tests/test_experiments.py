@@ -124,7 +124,7 @@ def test_the_documented_sweep_is_one(tmp_path):
     samples = {run.hyperparams.get("cem_samples") for run in runs if run.method == "CGP"}
     assert samples == {16, 64, 256}
     assert not any("cem_samples" in run.hyperparams for run in runs if run.method == "TQC")
-    rows = dict(re.findall(r"\| `(e\d)` .*\| (\d+) \|", documentation))
+    rows = dict(re.findall(r"\| `(e\d+)` .*\| (\d+) \|", documentation))
     assert {name: str(sum(len(load_sweep(each).runs()) for each in included_sweeps(name))) for name in rows} == rows
 
 
@@ -136,6 +136,28 @@ def test_short_runs_learn_too():
     assert starts("e3", steps=3_000) == {300}
     assert starts("e3", steps=3_000, hyperparams={"learning_starts": 50}) == {50}
     assert starts("e7", steps=3_000) == {0, 1_000, 10_000}
+
+
+def test_short_runs_learn_with_the_numbers_of_random_steps_that_a_file_does_not_name(tmp_path, sweep_of):
+    """10,000 is CGP's default, and the number in rl_zoo3's entry for TD3."""
+    tuned = {"algo": "td3", "tuned": True}
+    methods = {
+        "CGP": {"algo": "cgp", "hyperparams": {"policy": "MlpPolicy"}},
+        "TD3": tuned,
+        "PPO": {"algo": "ppo", "tuned": True},
+    }
+    sweep_of(methods=methods, steps=2_000)
+
+    def starts(**overrides):
+        return {
+            run.method: run.hyperparams.get("learning_starts")
+            for run in load_sweep(str(tmp_path / "mine.yml"), overrides).runs()
+        }
+
+    assert starts() == {"CGP": 200, "TD3": 200, "PPO": None}
+    assert starts(hyperparams={"learning_starts": 1_500}, methods={"CGP": methods["CGP"]}) == {"CGP": 1_500}
+    # Long runs have what their algorithm or their entry says
+    assert starts(steps=200_000) == {"CGP": None, "TD3": None, "PPO": None}
 
 
 def test_methods_of_ones_own(sweep_of):

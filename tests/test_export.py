@@ -6,9 +6,11 @@ import hashlib
 import json
 import os
 import pickle
+import re
 import shutil
 import struct
 import zipfile
+from collections import OrderedDict
 from pathlib import Path
 
 import gymnasium as gym
@@ -17,31 +19,47 @@ import onnx
 import onnxruntime
 import pytest
 import torch as th
+from environments import Reach
 from gymnasium import spaces
 from safetensors.torch import load_file, save_file
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from torch import nn
 
 from sb3_cgp import CGP
+from sb3_cgp.common.extras import how_to_install
+from sb3_cgp.export import boxes
 from sb3_cgp.export import description as exported
-from sb3_cgp.export.description import describe_box
+from sb3_cgp.export.boxes import describe_box
 
 FILES = ("policy.onnx", "policy.safetensors", "policy.json")
 VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float32)
 ASYMMETRIC = spaces.Box(np.array([-1.0, 0.5, -30.0], np.float32), np.array([2.0, 0.75, 5.0], np.float32))
 
 
+def by_key(function, *observations):
+    """Apply a function to observations, or to those of each key."""
+    if isinstance(observations[0], dict):
+        return {key: function(*(each[key] for each in observations)) for key in observations[0]}
+    return function(*observations)
+
+
 class AnyEnv(gym.Env):
-    """Random observations around a mean, whatever the spaces."""
+    """Random observations around a mean, whatever the spaces; goals too, for hindsight replay."""
 
     def __init__(self, observation_space, action_space, mean=0.0):
         self.observation_space, self.action_space, self.mean = observation_space, action_space, mean
 
     def _observe(self):
-        observation = self.observation_space.sample()
+        return by_key(self._scale, self.observation_space.sample())
+
+    def _scale(self, observation):
         return observation if observation.dtype == np.uint8 else (self.mean + 3.0 * observation).astype(observation.dtype)
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return np.zeros(len(np.atleast_2d(achieved_goal)), np.float32)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -54,7 +72,7 @@ class AnyEnv(gym.Env):
 def make_model(observation_space=VECTOR, action_space=ASYMMETRIC, normalize=None, policy="MlpPolicy", **kwargs):
     """A model whose actor and averaged actor differ, both with biases and actions well within the bounds."""
     # Far from zero, where float32 is coarse
-    mean = 0.0 if normalize is None or normalize.get("norm_obs") is False else 1000.0
+    mean = 0.0 if normalize is None or normalize.keys() & {"norm_obs", "norm_obs_keys"} else 1000.0
     env = DummyVecEnv([lambda: AnyEnv(observation_space, action_space, mean)])
     if normalize is not None:
         env = VecNormalize(env, **normalize)
@@ -72,12 +90,21 @@ def make_model(observation_space=VECTOR, action_space=ASYMMETRIC, normalize=None
 def observations_of(model, n=7):
     (mean,) = model.get_env().get_attr("mean")
     env = AnyEnv(model.observation_space, model.action_space, mean)
-    return np.stack([env._observe() for _ in range(n)])
+    return by_key(lambda *each: np.stack(each), *(env._observe() for _ in range(n)))
 
 
 def run_onnx(folder, observations):
     session = onnxruntime.InferenceSession(Path(folder) / "policy.onnx")
-    return session.run(None, {session.get_inputs()[0].name: observations})[0]
+    inputs = observations if isinstance(observations, dict) else {"observation": observations}
+    return session.run(["action"], inputs)[0]
+
+
+IMAGE, IMAGE_FIRST = (spaces.Box(0, 255, shape, np.uint8) for shape in ((36, 40, 3), (3, 36, 40)))
+DOUBLES = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+# In an order that is not the alphabet's, of the same shape, and with names that PyTorch gives to values of its graph
+NAMES = OrderedDict((name, VECTOR) for name in ("view", "cat", "linear", "low", "mu_0", "input-0", "arm/joints:left"))
+HER = dict(policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer)
+GOALS = spaces.Dict(observation=spaces.Box(-np.inf, np.inf, (2, 2), np.float64), achieved_goal=DOUBLES, desired_goal=DOUBLES)
 
 
 EXPORTS = {
@@ -95,6 +122,20 @@ EXPORTS = {
         policy="CnnPolicy",
         policy_kwargs=dict(net_arch=[8], features_extractor_kwargs=dict(features_dim=16)),
     ),
+    "Dict": dict(observation_space=spaces.Dict(NAMES), policy="MultiInputPolicy"),
+    "Dict of goals in float64, VecNormalize": HER | dict(observation_space=GOALS, normalize=dict(clip_obs=0.7)),
+    "Dict with images, one of two keys normalised, averaged": dict(
+        observation_space=spaces.Dict(image=IMAGE_FIRST, speed=DOUBLES, wheels=spaces.Box(-9, 9, (4,), np.float32)),
+        policy="MultiInputPolicy",
+        normalize=dict(norm_obs_keys=["speed"]),
+        inference="averaged_actor",
+        policy_kwargs=dict(net_arch=[8], features_extractor_kwargs=dict(cnn_output_dim=6)),
+    ),
+    "Dict with images that are not divided by 255": dict(
+        observation_space=spaces.Dict(image=IMAGE, vector=VECTOR),
+        policy="MultiInputPolicy",
+        policy_kwargs=dict(net_arch=[8], normalize_images=False),
+    ),
 }
 
 
@@ -110,12 +151,12 @@ def test_exports_act_as_predict_does(name, tmp_path):
     normalizer = model.get_vec_normalize_env()
     expected, _ = model.predict(observations if normalizer is None else normalizer.normalize_obs(observations))
     assert np.ptp(expected, axis=0).max() > 1e-2, "a constant policy would pass"
-    for batch, wanted in ((observations, expected), (observations[:1], expected[:1])):
+    for batch, wanted in ((observations, expected), (by_key(lambda each: each[:1], observations), expected[:1])):
         assert np.allclose(run_onnx(tmp_path, batch), wanted, rtol=1e-4, atol=1e-4)
-        actions, state = policy.predict(batch, state=("kept",), episode_start=np.ones(len(batch), bool), deterministic=False)
+        actions, state = policy.predict(batch, state=("kept",), episode_start=np.ones(len(wanted), bool), deterministic=False)
         assert np.allclose(actions, wanted, rtol=1e-5, atol=1e-5)
         assert (actions.dtype, actions.shape, state) == (wanted.dtype, wanted.shape, ("kept",))
-    single, _ = policy.predict(observations[0])
+    single, _ = policy.predict(by_key(lambda each: each[0], observations))
     assert single.shape == model.action_space.shape
     assert np.allclose(single, expected[0], rtol=1e-5, atol=1e-5)
 
@@ -147,6 +188,18 @@ def exports(tmp_path_factory):
     return folders, models
 
 
+@pytest.fixture(scope="module")
+def dict_export(tmp_path_factory):
+    """An export of goals and images, of which the goals are normalised; not to be written to."""
+    folder = tmp_path_factory.mktemp("dict_export")
+    shapes = dict(observation=spaces.Box(-np.inf, np.inf, (3,), np.float64), achieved_goal=DOUBLES, desired_goal=DOUBLES)
+    space = spaces.Dict(shapes | dict(image=IMAGE_FIRST))
+    kwargs = dict(net_arch=[8], features_extractor_kwargs=dict(cnn_output_dim=4))
+    model = make_model(space, normalize=dict(norm_obs_keys=["observation", "achieved_goal"]), **HER, policy_kwargs=kwargs)
+    model.export(folder)
+    return folder, model
+
+
 @pytest.fixture
 def folder(exports, tmp_path):
     """A copy of an export, to be spoilt."""
@@ -161,6 +214,47 @@ def test_channels_last_images_are_taken_as_predict_takes_them(tmp_path):
     policy = CGP.load_weights(tmp_path)
     assert np.allclose(policy.predict(images)[0], model.predict(images)[0], rtol=1e-5, atol=1e-5)
     assert policy.predict(images[0])[0].shape == (3,)
+
+
+def test_each_key_is_an_input_of_the_onnx_by_its_name(dict_export):
+    folder, model = dict_export
+    content = (folder / "policy.onnx").read_bytes()
+    onnx.checker.check_model(onnx.load_from_string(content), full_check=True)
+    found = {each.name: (each.type, each.shape[1:]) for each in onnxruntime.InferenceSession(content).get_inputs()}
+    doubles = "tensor(double)"
+    assert found == {
+        "achieved_goal": (doubles, [2]),
+        "desired_goal": (doubles, [2]),
+        "image": ("tensor(uint8)", [3, 36, 40]),
+        "observation": (doubles, [3]),
+    }
+    for other in (2, 3):
+        batch = by_key(lambda each, size=other: each[:size], observations_of(model))
+        assert run_onnx(folder, batch).shape == (other, 3)
+
+
+@pytest.mark.usefixtures("no_onnx")
+def test_channels_last_images_within_a_dict_are_taken_as_predict_takes_them(dict_export):
+    folder, model = dict_export
+    observations = observations_of(model, 4)
+    policy = CGP.load_weights(folder)
+    expected = policy.predict(observations)[0]
+    observations["image"] = observations["image"].transpose(0, 2, 3, 1)
+    assert np.array_equal(policy.predict(observations)[0], expected)
+
+
+@pytest.mark.usefixtures("no_onnx")
+def test_a_goal_policy_that_learnt_by_hindsight_is_evaluated_by_sb3_as_the_model_is(tmp_path):
+    env = VecNormalize(DummyVecEnv([Reach]))
+    arguments = HER | dict(learning_starts=10, batch_size=4, buffer_size=50, seed=0, policy_kwargs=dict(net_arch=[8]))
+    model = CGP(arguments.pop("policy"), env, **arguments).learn(20)
+    model.export(tmp_path)
+    env.training = False
+    returns = []
+    for policy, tried in ((model, env), (CGP.load_weights(tmp_path), env.venv)):
+        env.seed(3)
+        returns.append(evaluate_policy(policy, tried, n_eval_episodes=3, return_episode_rewards=True, warn=False)[1])
+    assert returns[0] == returns[1]
 
 
 @pytest.mark.usefixtures("no_onnx")
@@ -178,6 +272,33 @@ def test_wrong_observations_are_refused(exports):
     policy = CGP.load_weights(exports[0][0])
     with pytest.raises(ValueError, match="Unexpected observation shape"):
         policy.predict(np.zeros(4, np.float32))
+    with pytest.raises(ValueError, match=r"`observation` is .*, but must be an array, as in Box"):
+        policy.predict({"observation": np.zeros(3, np.float32)})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda found: found.pop("image"),
+            r"`observation` is .*, but must be a dictionary of exactly the keys achieved_goal,",
+        ),
+        (lambda found: found.update(other=np.zeros(3)), "a dictionary of exactly the keys"),
+        (lambda found: found.update(observation=np.zeros(4)), "Unexpected observation shape"),
+        (lambda found: found.update(observation=np.zeros((5, 3))), "one observation for every key, or batches of one length"),
+        (lambda found: found.update(observation=np.zeros(3)), "one observation for every key, or batches of one length"),
+        (lambda found: found.update(observation=np.zeros((1, 3))), "one observation for every key, or batches of one length"),
+    ],
+)
+def test_wrong_observations_of_a_dict_are_refused(dict_export, change, message):
+    folder, model = dict_export
+    policy, observations = CGP.load_weights(folder), observations_of(model, 4)
+    policy.predict(observations)
+    change(observations)
+    with pytest.raises(ValueError, match=message):
+        policy.predict(observations)
+    with pytest.raises(ValueError, match="must be a dictionary of the keys achieved_goal"):
+        policy.predict(np.zeros(3))
 
 
 def test_onnx_says_nothing_of_the_machine_it_was_written_on(exports):
@@ -217,7 +338,7 @@ def test_description_is_plain_json(exports):
 )
 def test_boxes_come_back_as_they_were(box):
     text = json.dumps(describe_box(box), allow_nan=False)
-    assert exported.read_box(json.loads(text), "space", exported.OBSERVATION_DTYPES) == box
+    assert boxes.read_box(json.loads(text), "space", boxes.OBSERVATION_DTYPES) == box
 
 
 # What cannot be exported
@@ -248,8 +369,20 @@ class FlattenTwice(nn.ReLU):
         (dict(policy_kwargs=dict(activation_fn=nn.PReLU)), "`activation_fn` is .*PReLU.*, but must be one of ReLU, "),
         (dict(observation_space=spaces.Discrete(3)), r"`observation_space` is Discrete\(3\), but must be a Box"),
         (
-            dict(observation_space=spaces.Dict(a=VECTOR), policy="MultiInputPolicy"),
-            r"`observation_space` is Dict.*, but must be a Box",
+            dict(observation_space=spaces.Dict(a=VECTOR, b=spaces.Discrete(2)), policy="MultiInputPolicy"),
+            r"`observation_space\['b'\]` is Discrete\(2\), but must be a Box to be exported",
+        ),
+        (
+            dict(observation_space=spaces.Dict(a=VECTOR, action=VECTOR), policy="MultiInputPolicy"),
+            r"`observation_space` is 'action', but must be of keys that are .* and not 'action', which names the ONNX output",
+        ),
+        (
+            dict(observation_space=spaces.Dict({"a b": VECTOR}), policy="MultiInputPolicy"),
+            r"`observation_space` is 'a b', but must be of keys that are 1 to 64 of the characters",
+        ),
+        (
+            dict(observation_space=spaces.Dict({f"k{i}": VECTOR for i in range(257)}), policy="MultiInputPolicy"),
+            r"`observation_space` is Dict.*, but must be of at most 256 keys",
         ),
         (
             dict(
@@ -306,8 +439,9 @@ def test_missing_extra_is_named(missing, tmp_path, monkeypatch):
 
     model = make_model()
     monkeypatch.setattr("importlib.import_module", import_module)
-    remedy = r'pip install "sb3-cgp\[export\]" \(in a clone: pip install -e "\.\[export\]"\)'
-    with pytest.raises(ImportError, match=rf"needs {missing}, which is not installed: {remedy}"):
+    remedy = re.escape(how_to_install("export"))
+    assert '".[export]"' in how_to_install("export")
+    with pytest.raises(ImportError, match=rf"needs {missing}, which is not installed. It is in the extra `export`: {remedy}"):
         model.export(tmp_path)
     if missing == "safetensors":
         with pytest.raises(ImportError, match=remedy):
@@ -443,12 +577,14 @@ def changed(*keys):
 
 MALFORMED = {
     "another format": (changed("format", "zip"), "`format` is 'zip'"),
-    "newer version": (changed("format_version", 2), "`format_version` is 2, but must be 1"),
+    "newer version": (changed("format_version", 3), "`format_version` is 3, but must be 1 or 2"),
     "version true": (changed("format_version", True), "`format_version` is True"),
     "no network": (lambda description: description.pop("network"), "`policy` is"),
     "extra key": (changed("code", "import os"), "`policy` is .*'code'"),
     "extra key within": (changed("network", "class", "os.system"), "`network` is .*'class'"),
     "network a list": (changed("network", []), r"`network` is \[\]"),
+    "extractor of a Dict": (changed("network", "features_extractor", "CombinedExtractor"), "`features_extractor` is 'Comb"),
+    "keys of a vector": (changed("normalization", "keys", ["observation"]), r"`normalization.keys` is \['observation'\]"),
     "unknown extractor": (changed("network", "features_extractor", "os.system"), "`features_extractor` is 'os.system'"),
     "unknown activation": (changed("network", "activation_fn", "PReLU"), "`activation_fn` is 'PReLU'"),
     "unhashable activation": (changed("network", "activation_fn", ["ReLU"]), r"`activation_fn` is \['ReLU'\]"),
@@ -481,9 +617,80 @@ MALFORMED = {
 }
 
 
+def of_box(index, *change):
+    """Set an entry of the description of one of a Dict's boxes."""
+    return changed("observation_space", "boxes", index, *change)
+
+
+def more_boxes(number, **entry):
+    """Add boxes to the description of a Dict."""
+
+    def change(description):
+        boxes = description["observation_space"]["boxes"]
+        boxes.extend({**boxes[0], "key": f"k{index}", **entry} for index in range(number))
+
+    return change
+
+
+MALFORMED_DICT = {
+    "no boxes": (changed("observation_space", "boxes", []), "`observation_space.boxes` is \\[\\]"),
+    "boxes of text": (changed("observation_space", "boxes", "abc"), "`observation_space.boxes` is 'abc'"),
+    "a box of text": (of_box(0, "abc"), "`observation_space.boxes` is 'abc'"),
+    "other entries": (changed("observation_space", "spaces", 1), "`observation_space` is .*'spaces'"),
+    "other entries of a box": (of_box(0, "class", "os.system"), "`observation_space.boxes` is .*'class'"),
+    "no key": (lambda description: description["observation_space"]["boxes"][0].pop("key"), "`observation_space.boxes` is"),
+    "key of a number": (of_box(0, "key", 1), "`observation_space.boxes.key` is 1, but must be 1 to 64 of the characters"),
+    "unhashable key": (of_box(0, "key", ["a"]), r"`observation_space.boxes.key` is \['a'\]"),
+    "empty key": (of_box(0, "key", ""), "`observation_space.boxes.key` is ''"),
+    "long key": (of_box(0, "key", "a" * 65), "`observation_space.boxes.key` is 'aaa"),
+    "path": (of_box(0, "key", "../policy"), "`observation_space.boxes.key` is '../policy'"),
+    "control characters": (of_box(0, "key", "a\n"), r"`observation_space.boxes.key` is 'a\\n'"),
+    "letters of another alphabet": (of_box(0, "key", "\u0430"), "`observation_space.boxes.key` is"),
+    "the output's name": (of_box(0, "key", "action"), "`observation_space.boxes.key` is 'action'"),
+    "key twice": (of_box(0, "key", "observation"), "`observation_space.boxes.key` is 'observation', but must be .* once"),
+    "an attribute of PyTorch's": (of_box(0, "key", "forward"), "`network` is .*which does not fit the spaces: .*forward"),
+    "another attribute": (of_box(0, "key", "__class__"), "`network` is .*which does not fit the spaces: .*__class__"),
+    "another key": (of_box(3, "key", "other"), "`normalization.keys` is .*, but must be a list of some of"),
+    "another image": (of_box(2, "key", "picture"), "missing are .*extractors.picture.cnn"),
+    "many keys": (more_boxes(1_000), "`observation_space.boxes` is .*, but must be a list of 1 to 256"),
+    "huge": (more_boxes(1, shape=[2**40]), "`observation_space.boxes.k0.shape` is .* of at most"),
+    "huge in total": (more_boxes(5, shape=[2**22]), "`observation_space.boxes.k3.shape` is .* of at most"),
+    "dtype of objects": (of_box(0, "dtype", "object"), "`observation_space.boxes.achieved_goal.dtype` is 'object'"),
+    "a box more": (more_boxes(1), "mu.0.weight is .* but must be"),
+    "extractor of vectors": (changed("network", "features_extractor", "FlattenExtractor"), "`features_extractor` is 'Flatten"),
+    "extractor of images": (changed("network", "features_extractor", "NatureCNN"), "`features_extractor` is 'NatureCNN'"),
+    "other arguments": (
+        changed("network", "features_extractor_kwargs", {"features_dim": 4}),
+        "`features_extractor_kwargs` is",
+    ),
+    "width": (changed("network", "features_extractor_kwargs", {"cnn_output_dim": 0}), "`cnn_output_dim` is 0"),
+    "wide": (changed("network", "features_extractor_kwargs", {"cnn_output_dim": 10**12}), "but must be .*1000000000000"),
+    "overflowing": (changed("network", "features_extractor_kwargs", {"cnn_output_dim": 10**30}), "policy.json was refused"),
+    "no keys normalised": (changed("normalization", "keys", None), "`normalization.keys` is None"),
+    "unknown key normalised": (changed("normalization", "keys", ["speed"]), r"`normalization.keys` is \['speed'\]"),
+    "unhashable key normalised": (changed("normalization", "keys", [["a"]]), r"`normalization.keys` is \[\['a'\]\]"),
+    "key normalised twice": (changed("normalization", "keys", ["observation"] * 2), "`normalization.keys` is .* each once"),
+    "one key less": (changed("normalization", "keys", ["observation"]), r"too many \['normalization.mean.achieved_goal'"),
+    "one key more": (
+        changed("normalization", "keys", ["observation", "achieved_goal", "image"]),
+        r"missing are \['normalization.mean.image'",
+    ),
+    "version without keys": (changed("format_version", 1), "`normalization` is .*'keys'"),
+}
+
+
 @pytest.mark.parametrize("name", MALFORMED)
 def test_descriptions_that_say_what_is_not_allowed_are_refused(folder, name):
-    change, message = MALFORMED[name]
+    expect_refusal(folder, *MALFORMED[name])
+
+
+@pytest.mark.parametrize("name", MALFORMED_DICT)
+def test_descriptions_of_a_dict_that_say_what_is_not_allowed_are_refused(dict_export, tmp_path, name):
+    expect_refusal(Path(shutil.copytree(dict_export[0], tmp_path / "export")), *MALFORMED_DICT[name])
+
+
+def expect_refusal(folder, change, message):
+    """Change a description, and expect that it is refused with the message."""
     path = folder / "policy.json"
     description = json.loads(path.read_text())
     change(description)
@@ -550,6 +757,37 @@ def test_tensors_that_do_not_belong_to_the_network_are_refused(folder, change, m
     seal(folder)
     with pytest.raises(ValueError, match=rf"(?s)was refused: .*{message}"):
         CGP.load_weights(folder)
+
+
+def test_an_export_of_the_formats_first_version_is_read(tmp_path):
+    """As sb3-cgp wrote it before observations had keys."""
+    content = {
+        "format": "sb3-cgp policy",
+        "format_version": 1,
+        "versions": {"sb3_cgp": "0.1.0", "torch": "2.13.0+cpu"},
+        "observation_space": {"shape": [2], "dtype": "float32", "low": None, "high": None},
+        "action_space": {"shape": [1], "dtype": "float32", "low": -2.0, "high": 2.0},
+        "network": {
+            "net_arch": [],
+            "activation_fn": "ReLU",
+            "features_extractor": "FlattenExtractor",
+            "features_extractor_kwargs": {},
+            "normalize_images": True,
+        },
+        "inference": "actor",
+        "normalization": {"epsilon": 0.0, "clip_obs": 10.0},
+    }
+    statistics = {
+        "normalization.mean": th.tensor([1.0, 2.0]).double(),
+        "normalization.variance": th.tensor([4.0, 9.0]).double(),
+    }
+    save_file({"mu.0.weight": th.tensor([[0.5, -1.0]]), "mu.0.bias": th.tensor([0.25]), **statistics}, tmp_path / FILES[1])
+    (tmp_path / "policy.onnx").write_bytes(b"")
+    (tmp_path / "policy.json").write_text(json.dumps(content | {"sha256": {}}))
+    seal(tmp_path)
+    action, _ = CGP.load_weights(tmp_path).predict(np.array([3.0, -1.0], np.float32))
+    # Normalised, the observation is (1, -1)
+    assert action == pytest.approx(2.0 * np.tanh(0.5 + 1.0 + 0.25), rel=1e-5)
 
 
 @pytest.mark.parametrize("name", FILES[:2])

@@ -1,12 +1,15 @@
 """The extras: what a plain install imports, what works in it, and errors that name the extra."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from sb3_cgp.common.extras import import_from_extra, require_from_extra
+from benchmark.sweeps.storages import open_storage
+from sb3_cgp import __version__
+from sb3_cgp.common.extras import how_to_install, import_from_extra, require_from_extra
 from sb3_cgp.zoo import register
 from sb3_cgp.zoo.resume import main
 
@@ -55,9 +58,7 @@ def test_registration_and_resumption_without_rl_zoo3_name_the_extra(missing, mon
     for name in [name for name in sys.modules if name.partition(".")[0] == "rl_zoo3"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
-    remedy = (
-        rf'needs {missing}, which is not installed: pip install "sb3-cgp\[zoo\]" \(in a clone: pip install -e "\.\[zoo\]"\)'
-    )
+    remedy = rf"needs {missing}, which is not installed. It is in the extra `zoo`: {re.escape(how_to_install('zoo'))}"
     with pytest.raises(ImportError, match=f"Registering CGP in rl_zoo3 {remedy}"):
         register()
     with pytest.raises(SystemExit, match=f"Error: Resuming a run of rl_zoo3 {remedy}"):
@@ -77,3 +78,50 @@ def test_a_package_that_is_required_is_not_imported(monkeypatch, tmp_path):
     require_from_extra("package_of_an_extra", "zoo", "A test")
     with pytest.raises(ImportError, match=r'A test needs missing_package, .* -e "\.\[zoo\]"'):
         require_from_extra("missing_package", "zoo", "A test")
+
+
+def test_the_advice_on_extras_needs_no_package_index_that_has_sb3_cgp():
+    """Each command names a path, of a clone or of a wheel, with the extra behind it."""
+    advice = how_to_install("export")
+    targets = re.findall(r'pip install [^;"]*"([^"]*)"', advice)
+    assert targets == [".[export]", f"sb3_cgp-{__version__}-py3-none-any.whl[export]"]
+    assert "-c constraints.txt" in advice
+
+
+COMMANDS = sorted(path.stem for path in (ROOT / "benchmark").glob("*.py") if path.stem != "__init__")
+SWEEPS, EXPORT = ("sweep", "tune", "worker"), ("latency",)
+
+
+@pytest.mark.parametrize(
+    ("missing", "extra", "refused"),
+    [
+        ("rl_zoo3", "zoo", COMMANDS),
+        ("rliable", "zoo", COMMANDS),
+        ("pydantic", "sweeps", SWEEPS),
+        ("onnxscript", "export", EXPORT),
+    ],
+)
+def test_every_command_of_benchmark_names_the_extra_that_it_lacks(missing, extra, refused):
+    """No other command needs the extra."""
+    found = python(f"""
+import importlib, sys
+sys.modules[{missing!r}] = None
+for command in {COMMANDS}:
+    try:
+        importlib.import_module(f"benchmark.{{command}}")
+    except ImportError as error:
+        print(command, error, sep="|")
+""").splitlines()
+    messages = dict(line.split("|") for line in found)
+    assert sorted(messages) == sorted(refused)
+    expected = f"needs {missing}, which is not installed. It is in the extra `{extra}`: {how_to_install(extra)}"
+    assert all(message.endswith(expected) for message in messages.values())
+
+
+def test_a_database_whose_driver_is_missing_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "psycopg2", None)
+    with pytest.raises(
+        ValueError,
+        match=re.escape(f"driver psycopg2 is not installed. It is in the extra `sweeps`: {how_to_install('sweeps')}"),
+    ):
+        open_storage("postgresql://user@host/sweeps")

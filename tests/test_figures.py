@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 from finished_studies import SWEEP, record, runs, write_study
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 from tables import unpadded
 
 from benchmark.common.style import FURTHER, METHODS, styles
 from benchmark.figures import main
+from benchmark.reporting import drawing
 from benchmark.reporting import figures as command
-from benchmark.reporting.drawing import stability
+from benchmark.reporting.drawing import differing_range, final_rewards, stability
 from benchmark.reporting.figures import figures, study_folders
 from benchmark.reporting.page import reward_tables
 from benchmark.reporting.scores import curves, evaluation_grid, read_study, score_table
@@ -49,7 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write empty files in place of pictures, for tests of what the page says."""
-    for name in ("learning_curves", "final_rewards", "stability", "sensitivity", "values"):
+    for name in ("curves_by_steps", "curves_by_minutes", "final_rewards", "stability", "sensitivity", "values"):
         monkeypatch.setattr(command, name, lambda *args: b"")
 
 
@@ -61,12 +63,56 @@ def test_figures_follow_from_the_runs(folder: Path) -> None:
     assert drawn == {"stability.png"} | expected | {f"tasks/{name}.png" for name in tasks}
 
 
+def test_stability_is_drawn_where_methods_differ() -> None:
+    levels = np.array([-900.0, -200.0, -150.0, -120.0, -110.0])
+    shares = np.array([[1.0, 1.0, 0.9, 0.5, 0.1], [1.0, 0.95, 0.7, 0.5, 0.0]])
+    low, high = differing_range(levels, shares)
+    assert -152 < low < -150
+    assert -110 < high < -108
+    low, high = differing_range(levels, shares[:1])
+    assert low < -900 < -110 < high
+
+
+def test_random_actions_do_not_squash_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept: list[Figure] = []
+    monkeypatch.setattr(drawing, "png", lambda figure: kept.append(figure) or b"")
+    for methods in (["CGP-Online", "TD3", "Random"], ["Random"]):
+        chosen = read_study(write_study(tmp_path / "-".join(methods), runs(score, methods)))
+        final_rewards(chosen, score_table([chosen]), 20)
+    shown = [[label.get_text() for label in figure.axes[0].get_yticklabels()] for figure in kept]
+    assert shown == [["CGP-Online", "TD3"], ["Random"]]
+    low, high = kept[0].axes[0].get_xlim()
+    assert -360 < low < high < -100
+
+
+def test_a_row_of_panels_for_each_value_and_a_line_for_each_of_the_last_axis(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: list[Figure] = []
+    monkeypatch.setattr(drawing, "png", lambda figure: kept.append(figure) or b"")
+    for name, rows in (("axis", 1), ("axes", 2)):
+        chosen = read_study(folder / name)
+        drawing.sensitivity(chosen, "Pendulum-v1")
+        panels = kept[-1].axes
+        assert len(panels) == rows * len(BASELINES)
+        assert [panel.get_title() for panel in panels[: len(BASELINES)]] == list(BASELINES)
+        last = list(chosen.axes.values())[-1]
+        assert all([str(line.get_label()) for line in panel.get_lines()] == list(map(str, last)) for panel in panels)
+
+
 def test_figures_are_pictures_of_some_size_and_few_bytes(folder: Path) -> None:
     for path in folder.rglob("*.png"):
         height, width, _ = imread(path).shape
         assert 300 < height < 2_000
         assert 400 < width < 2_000
-        assert path.stat().st_size < 150_000
+        assert path.stat().st_size < 250_000
+
+
+def test_pictures_have_the_methods_own_colours(folder: Path) -> None:
+    pixels = (imread(folder / "figures/tasks/final_rewards.png")[:, :, :3] * 255).round().astype(int)
+    shown = {f"#{red:02X}{green:02X}{blue:02X}" for red, green, blue in np.unique(pixels.reshape(-1, 3), axis=0)}
+    for look in styles([*BASELINES, "My-PPO"]).values():
+        assert look["color"].upper() in shown
 
 
 def test_page_shows_every_figure_with_its_command(folder: Path, tmp_path: Path) -> None:

@@ -1,9 +1,12 @@
 """A training that ends before the first gradient step says so, and no other does."""
 
+import re
 import warnings
 
+import gymnasium as gym
 import pytest
 from guarded import SMALL, GuardedTD3, located
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cgp.resumption.algorithm import resumable
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
@@ -31,6 +34,80 @@ def test_a_training_without_a_gradient_step_warns_and_no_other_does(
             message = str(warned[0].message)
             assert f"ends at environment step {model.num_timesteps}, " in message
             assert f"after step learning_starts={learning_starts}" in message
+
+
+def limited(length):
+    """An environment without an end of its own, and Gymnasium's limit."""
+    return gym.make("Pendulum-v1", max_episode_steps=length)
+
+
+class Started(BaseCallback):
+    """Notes how many warnings there were at the first step."""
+
+    def __init__(self, warned):
+        super().__init__()
+        self.warned, self.before = warned, None
+
+    def _on_step(self):
+        self.before = len(self.warned) if self.before is None else self.before
+        return True
+
+
+@pytest.mark.parametrize("frequency", [1, 3])
+@pytest.mark.parametrize("learning_starts", [12, 15, 16, 25, 26])
+def test_episodes_that_cannot_become_long_enough_are_warned_of_before_the_first_step(frequency, learning_starts):
+    arguments = SMALL | dict(train_freq=(frequency, "episode"), learning_starts=learning_starts)
+    model = GuardedTD3("MlpPolicy", limited(5), **arguments)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        started = Started(warned)
+        model.learn(11, started)
+    # The last rollout begins at step 10 at the latest
+    cannot = 10 + 5 * frequency <= learning_starts
+    assert started.before == cannot
+    assert len(warned) == (model._n_updates == 0)
+    assert (f"ends at environment step {10 + 5 * frequency} at the latest" in str(warned[0].message)) if cannot else True
+
+
+@pytest.mark.parametrize(
+    ("steps", "reset", "remedy"),
+    [
+        ((50,), True, "such as 5."),
+        ((150, 50), True, "such as 5, or continue .* `reset_num_timesteps=False`."),
+        ((40, 40), False, "such as 44."),
+    ],
+)
+def test_the_remedy_takes_gradient_steps(steps, reset, remedy):
+    model = GuardedTD3("MlpPolicy", located(), **(SMALL | dict(learning_starts=100)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for n in steps[:-1]:
+            model.learn(n, reset_num_timesteps=reset)
+    before = model._n_updates
+    with pytest.warns(UserWarning, match=remedy) as warned:
+        model.learn(steps[-1], reset_num_timesteps=reset)
+    assert model._n_updates == before
+    fresh = GuardedTD3("MlpPolicy", located(), **SMALL)
+    fresh.learning_starts = int(re.search(r"such as (\d+)", str(warned[0].message))[1])
+    fresh.num_timesteps = 0 if reset else sum(steps[:-1])
+    fresh.learn(steps[-1], reset_num_timesteps=reset)
+    assert fresh._n_updates > 0
+
+
+@pytest.mark.parametrize(
+    ("verbose", "learning_starts", "printed"),
+    [(0, 12, ""), (1, 0, ""), (1, 6, "Actions are random in the next 6 of 20 environment steps (learning_starts=6), "),
+     (1, 12, "without gradient steps. That is more than half: a smaller `learning_starts` trains more.")],
+)  # fmt: skip
+def test_the_share_of_random_steps_is_printed_with_verbose(verbose, learning_starts, printed, capsys):
+    arguments = SMALL | dict(learning_starts=learning_starts, verbose=verbose)
+    model = GuardedTD3("MlpPolicy", located(), **arguments)
+    capsys.readouterr()
+    model.learn(20)
+    found = capsys.readouterr().out
+    assert printed in found
+    assert ("Actions are random" in found) == bool(printed)
+    assert ("more than half" in found) == ("more than half" in printed)
 
 
 @pytest.mark.filterwarnings("error")

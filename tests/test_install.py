@@ -270,5 +270,5 @@ def test_the_hook_of_a_plain_install_is_silent(plain):
 )
 def test_what_a_plain_install_lacks_is_named_with_the_extra(code, extra, missing, plain):
     catching = f"try:\n {code}\nexcept (ImportError, SystemExit) as error:\n print(error)"
-    remedy = f'pip install "sb3-cgp[{extra}]" (in a clone: pip install -e ".[{extra}]")'
-    assert f"needs {missing}, which is not installed: {remedy}\n" in plain.run("-c", catching)
+    remedy = f'It is in the extra `{extra}`: in a clone, pip install -c constraints.txt -e ".[{extra}]"; with the wheel'
+    assert f"needs {missing}, which is not installed. {remedy}" in plain.run("-c", catching)

@@ -25,7 +25,7 @@ case "$*" in
   "-m venv"*)
     mkdir -p .venv/bin
     for program in python lint-imports; do cp "$0" .venv/bin/$program && chmod +x .venv/bin/$program; done ;;
-  "-m benchmark.plan"*) echo "250 4" ;;
+  "-m benchmark.plan"*) echo "250 4 $WARM_UP" ;;
   *"$FAIL"*) [ -z "$FAIL" ] ;;
 esac
 """
@@ -52,7 +52,7 @@ class Clone:
         ended = subprocess.run(
             ["make", f"PYTHON={self.python}", *arguments],
             cwd=self.folder,
-            env={**inherited, "CALLS": str(self.calls_file), "FAIL": "", "OLD": "", **environment},
+            env={**inherited, "CALLS": str(self.calls_file), "FAIL": "", "OLD": "", "WARM_UP": "", **environment},
             capture_output=True,
             text=True,
         )
@@ -92,12 +92,22 @@ def test_train_takes_the_settings_of_a_run(clone: Clone) -> None:
         "PARAMS=batch_size:128 policy_loss:\"'qgp'\"", "ARGS=--save-freq 100", "THREADS=4",
     )  # fmt: skip
     assert starting(calls, "-m benchmark.plan") == [
-        "-m benchmark.plan --algo td3 --env Ant-v5 --folder <my logs> --steps 60000"
+        "-m benchmark.plan --algo td3 --env Ant-v5 --folder <my logs> --steps 60000 "
+        "-- -params batch_size:128 policy_loss:'qgp' --save-freq 100"
     ]
     assert starting(calls, "-m rl_zoo3.train") == [
         "-m rl_zoo3.train --algo td3 --env Ant-v5 --seed 2 --num-threads 4 --n-timesteps 60000 --eval-freq 500 "
         "--eval-episodes 10 --log-folder <my logs> --progress -params batch_size:128 policy_loss:'qgp' --save-freq 100"
     ]
+
+
+@pytest.mark.parametrize(
+    ("params", "expected"), [("", "learning_starts:25"), ("batch_size:8 tau:1", "learning_starts:25 batch_size:8 tau:1")]
+)
+def test_the_planned_warm_up_is_a_hyperparameter_of_the_run(params: str, expected: str, clone: Clone) -> None:
+    calls, ended = clone.make("train", "STEPS=250", f"PARAMS={params}", "ARGS=--uuid", WARM_UP="learning_starts:25")
+    assert ended.returncode == 0, ended.stderr
+    assert starting(calls, "-m rl_zoo3.train")[0].endswith(f"--progress -params {expected} --uuid")
 
 
 def test_settings_are_not_taken_from_the_environment(clone: Clone) -> None:

@@ -40,3 +40,44 @@ def test_refuses_a_length_that_is_none(steps: str, capsys: pytest.CaptureFixture
     with pytest.raises(SystemExit):
         plan.main([f"--steps={steps}"])
     assert f"argument --steps: '{steps}' is not an integer >= 1" in capsys.readouterr().err
+
+
+def planned(capsys: pytest.CaptureFixture[str], tmp_path: Path, *arguments: str) -> tuple[list[str], str]:
+    """The words that the Makefile reads, and the line for the user."""
+    plan.main(["--folder", str(tmp_path), *arguments])
+    captured = capsys.readouterr()
+    return captured.out.split()[2:], captured.err
+
+
+@pytest.mark.parametrize(("algo", "env"), [("cgp", "Reacher-v5"), ("td3", "Pendulum-v1"), ("cgp", "Swimmer-v5")])
+@pytest.mark.parametrize("length", [["--steps", "4000"], ["--", "-n", "4000"]])
+def test_at_most_a_tenth_of_a_shortened_run_is_random(algo: str, env: str, length: list[str], capsys, tmp_path: Path) -> None:
+    overrides, said = planned(capsys, tmp_path, "--algo", algo, "--env", env, *length)
+    assert overrides == ["learning_starts:400"]
+    assert said.startswith("Of the 4,000 steps, 400 are random (learning_starts=400), ")
+    assert 'PARAMS="learning_starts:..." sets another number' in said
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        # The YAML file's length, a longer run, the user's own number, algorithms with few random steps and with none
+        [],
+        ["--steps", "2000000"],
+        ["--steps", "4000", "--", "-params", "batch_size:8", "learning_starts:5000"],
+        ["--steps", "4000", "--algo", "sac"],
+        ["--steps", "4000", "--algo", "ppo"],
+    ],
+)
+def test_other_runs_keep_their_random_steps(arguments: list[str], capsys, tmp_path: Path) -> None:
+    assert planned(capsys, tmp_path, *arguments) == ([], "")
+
+
+def test_the_plan_is_made_for_the_users_own_hyperparameters(capsys, tmp_path: Path) -> None:
+    conf_file = tmp_path / "mine.yml"
+    conf_file.write_text("Reacher-v5: {n_timesteps: 4000, policy: MlpPolicy, learning_starts: 300}")
+    assert planned(capsys, tmp_path, "--env", "Reacher-v5", "--", "--conf-file", str(conf_file)) == ([], "")
+    overrides, _ = planned(capsys, tmp_path, "--env", "Reacher-v5", "--steps", "1000", "--", "--conf-file", str(conf_file))
+    assert overrides == ["learning_starts:100"]
+    plan.main(["--env", "Reacher-v5", "--folder", str(tmp_path), "--", "-conf", str(conf_file)])
+    assert capsys.readouterr().out == "200 1\n"

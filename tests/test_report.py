@@ -10,13 +10,13 @@ import pytest
 import torch as th
 from matplotlib.image import imread
 from rl_zoo3.train import train
-from stable_baselines3 import TD3
+from stable_baselines3 import PPO, TD3
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from benchmark import report
-from benchmark.reporting import run_curves, zoo_runs
+from benchmark.reporting import run_curves, run_reports, zoo_runs
 from sb3_cgp import CGP
 
 ENV = "Pendulum-v1"
@@ -86,6 +86,26 @@ def test_record_says_what_ran(logs: Path) -> None:
     assert record["machine"]["torch_threads"] == th.get_num_threads()
     monitored = (logs / "cgp" / f"{ENV}_1" / "0.monitor.csv").read_text().splitlines()
     assert record["seconds_to_last_training_episode"] == pytest.approx(float(monitored[-1].split(",")[2]))
+
+
+def test_report_shows_the_gradient_steps(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record = run_report(logs, "cgp", exp_id=1)
+    # One for each step after the random ones
+    assert record["gradient_steps"] == 350
+    assert "seed 3, after 400 steps, 350 gradient steps\n" in capsys.readouterr().out
+
+
+def test_report_says_that_nothing_was_learnt(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.warns(UserWarning, match="Nothing is learnt"):
+        zoo_train(tmp_path, "cgp", "--eval-freq", "-1", "-params", *TINY[1:], "learning_starts:400")
+    assert run_report(tmp_path, "cgp", exp_id=1)["gradient_steps"] == 0
+    assert "after 400 steps, no gradient step: nothing was learnt\n" in capsys.readouterr().out
+
+
+def test_epochs_are_not_taken_for_gradient_steps() -> None:
+    model = PPO("MlpPolicy", ENV, n_steps=8, batch_size=8, n_epochs=3, policy_kwargs=dict(net_arch=[4])).learn(8)
+    assert run_reports.gradient_steps(model) is None
+    assert run_reports.length_in_words({"steps": 8, "gradient_steps": None}) == "8 steps"
 
 
 def test_curve_is_that_of_the_evaluations(logs: Path) -> None:

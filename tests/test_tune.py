@@ -411,6 +411,27 @@ def test_the_command_writes_what_rl_zoo3_trains(tmp_path, monkeypatch):
     assert (model.gamma, model.cem_samples) == (entry["gamma"], 8)
 
 
+@pytest.mark.parametrize(
+    ("options", "random", "is_said"),
+    [
+        (["--steps", "800"], 80, True),
+        (["--steps", "800", "--set", "learning_starts=500"], 500, False),
+        # As long as the entry says, or longer
+        ([], 10_000, False),
+        (["--steps", "30000"], 10_000, False),
+    ],
+)
+@pytest.mark.parametrize("algo", ["cgp", "td3"])
+def test_at_most_a_tenth_of_a_shortened_run_is_random(algo, options, random, is_said, capsys):
+    tuning = tune.tuning_of(tune.parse(["--algo", algo, "--env", "Pendulum-v1", *options]))
+    study = optuna.create_study(sampler=RandomSampler(seed=0))
+    tuning.sample(study.ask())
+    entry = tuning.entry(study.trials[0])
+    assert entry["n_timesteps"] == (int(options[1]) if options else 20_000)
+    assert entry["learning_starts"] == random
+    assert ("Of the 800 steps, 80 are random" in capsys.readouterr().err) == is_said
+
+
 class Process:
     """A process that has ended."""
 

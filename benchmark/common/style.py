@@ -8,6 +8,7 @@ from typing import Any
 METHODS: dict[str, dict[str, Any]] = {
     "CGP-Online": dict(color="#0072B2", linestyle="-", marker="o"),
     "CGP-Offline": dict(color="#56B4E9", linestyle="--", marker="o"),
+    "CGP-Light": dict(color="#661100", linestyle="-", marker="P"),
     "QGP-Online": dict(color="#009E73", linestyle="-", marker="^"),
     "QGP-Offline": dict(color="#7A7A00", linestyle="--", marker="^"),
     "CEM": dict(color="#000000", linestyle=":", marker="X"),
@@ -16,13 +17,13 @@ METHODS: dict[str, dict[str, Any]] = {
     "DDPG": dict(color="#E69F00", linestyle=(0, (4, 1, 1, 1, 1, 1)), marker="v"),
     "Random": dict(color="#7F7F7F", linestyle=(0, (1, 3)), marker="x"),
 }
-# For methods that are not in the paper
+# For all other methods
 FURTHER: list[dict[str, Any]] = [
     dict(color=color, linestyle=linestyle, marker=marker)
     for linestyle, marker, color in product(
         [(0, (6, 2)), (0, (2, 1)), (0, (8, 2, 2, 2))],
-        ["P", "*", "<", ">", "h"],
-        ["#882255", "#332288", "#117733", "#999933", "#661100"],
+        ["p", "*", "<", ">", "h"],
+        ["#882255", "#332288", "#117733", "#999933", "#44AA99"],
     )
 ]
 
@@ -31,7 +32,7 @@ def styles(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
     """
     Return the style of each method.
 
-    :param methods: the methods; the style of one that is not in the paper depends on its name alone, unless two would look
+    :param methods: the methods; the style of one that has none of its own depends on its name alone, unless two would look
         the same
     :return: Matplotlib's colour, line style and marker, by method
     """

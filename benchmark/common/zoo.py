@@ -2,10 +2,12 @@
 
 import argparse
 import contextlib
+import inspect
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
 
 from sb3_cgp.zoo.registration import register
@@ -26,6 +28,36 @@ def read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str
     with silence():
         hyperparams, _ = manager.read_hyperparameters()
     return dict(hyperparams)
+
+
+def shortened_warm_up(algo: str, hyperparams: Mapping[str, Any], steps: int) -> dict[str, int]:
+    """
+    Return the hyperparameter by which at most a tenth of a shortened run's steps are random.
+
+    :param algo: the algorithm's name in rl_zoo3
+    :param hyperparams: the run's hyperparameters
+    :param steps: environment steps of the run
+    :return: ``learning_starts``; nothing where no more steps are random than that
+    """
+    parameter = inspect.signature(ALGOS[algo]).parameters.get("learning_starts")
+    default = 0 if parameter is None else parameter.default
+    most = steps // 10
+    return {"learning_starts": most} if hyperparams.get("learning_starts", default) > most else {}
+
+
+def warm_up_in_words(steps: int, learning_starts: int, remedy: str) -> str:
+    """
+    Return the line that tells the user of a shortened warm-up.
+
+    :param steps: environment steps of each run
+    :param learning_starts: those of them that are random
+    :param remedy: the option that sets another number
+    :return: the line
+    """
+    return (
+        f"Of the {steps:,} steps, {learning_starts:,} are random (learning_starts={learning_starts}), as at most a tenth of a "
+        f"shortened run is; {remedy} sets another number"
+    )
 
 
 @contextlib.contextmanager

@@ -1,18 +1,15 @@
-"""The figures of a study: learning curves, stability, sensitivity to each axis, final rewards."""
+"""The figures of a study: stability, sensitivity to each axis, final rewards."""
 
-import io
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, MaxNLocator
-from PIL import Image
 
 from benchmark.common.style import styles
+from benchmark.reporting.canvas import BAND, draw_line, label_steps, legend, panels, png, styled
+from benchmark.reporting.comparisons import RANDOM
 from benchmark.reporting.estimates import (
     REPETITIONS,
     bootstrap,
@@ -23,107 +20,16 @@ from benchmark.reporting.estimates import (
 )
 from benchmark.reporting.scores import Study, axis_in_words, curves, evaluation_grid, floors, value_in_words
 
-PANEL = (4.0, 3.2)
 LINE_STYLES: list[Any] = ["-", "--", "-.", ":", (0, (4, 1, 1, 1, 1, 1)), (0, (8, 2))]
 MARKERS = "osD^vXP"
-# Markers on a line, so that it is told from others without its colour
-MARKS = 8
+# Methods differ where the highest and the lowest of their shares are this far apart
+DIFFERENCE = 0.1
 
 
-def png(figure: Figure) -> bytes:
-    """
-    Save a figure.
-
-    :param figure: the figure
-    :return: the picture, the same for the same figure, in few colours and so in few bytes
-    """
-    drawn, picture = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=120)
-    Image.open(drawn).convert("RGB").quantize(128, dither=Image.Dither.NONE).save(picture, format="png", optimize=True)
-    return picture.getvalue()
-
-
-def panels(number: int, share: bool = True, columns: int | None = None) -> tuple[Figure, list[Axes]]:
-    """
-    Lay out panels beside each other, and in rows.
-
-    :param number: how many
-    :param share: whether all have the same vertical axis
-    :param columns: how many beside each other; None takes up to two or three, whichever fills the rows
-    :return: the figure, and its panels
-    """
-    columns = columns or (3 if number == 3 or number > 4 else min(number, 2))
-    rows = -(-number // columns)
-    # No pyplot: its global figure list and its choice of a screen back-end are of no use here
-    figure = Figure(figsize=(PANEL[0] * columns, PANEL[1] * rows + 0.7), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, sharey=share).ravel()
-    for axes in grid[number:]:
-        axes.remove()
-    for axes in grid[:number]:
-        axes.grid(alpha=0.3)
-        axes.tick_params(labelleft=True)
-        axes.xaxis.set_major_locator(MaxNLocator(5))
-    return figure, list(grid[:number])
-
-
-def legend(figure: Figure, panel: Sequence[Axes], title: str | None = None) -> None:
-    """
-    Write one legend above all panels.
-
-    :param figure: the figure
-    :param panel: its panels
-    :param title: title of the legend
-    """
-    entries = {label: handle for axes in panel for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    # An entry is about as wide as half a panel
-    columns = max(min(len(entries), int(figure.get_figwidth() / PANEL[0] * 2.3)), 1)
-    look: dict[str, Any] = dict(loc="outside upper center", ncols=columns, frameon=False, handlelength=3.2)
-    figure.legend(list(entries.values()), list(entries), title=title, **look)
-
-
-def learning_curves(study: Study, task: str, repetitions: int = REPETITIONS) -> bytes:
-    """
-    Draw a task's learning curves: mean and range over seeds, as the paper, and interquartile mean with its 95 % interval.
-
-    :param study: the study
-    :param task: the task
-    :param repetitions: number of bootstrap samples
-    :return: the picture, as PNG
-    """
-    figure, (left, right) = panels(2)
-    floor, grid = floors(study.records)[task], evaluation_grid(study.records, task)
-    for method, look in styles(study.methods).items():
-        records = [record for record in study.records if (record.method, record.task) == (method, task)]
-        if not records or len(grid) == 0:
-            continue
-        lines = curves(records, floor, grid)
-        _line(left, grid, lines.mean(axis=0), method, look)
-        left.fill_between(grid, lines.min(axis=0), lines.max(axis=0), color=look["color"], alpha=0.12, linewidth=0)
-        middle, interval = bootstrap(interquartile_mean, [[lines]], repetitions)
-        _line(right, grid, middle, method, look)
-        if interval is not None:
-            right.fill_between(grid, *interval, color=look["color"], alpha=0.12, linewidth=0)
-    left.set(title="mean, and range over seeds", ylabel="return")
-    right.set(title="interquartile mean, 95 % interval")
-    for panel in (left, right):
-        _label_steps(panel)
-    legend(figure, [left], task)
-    return png(figure)
-
-
-def _line(panel: Axes, x: np.ndarray, y: np.ndarray, label: str, look: dict[str, Any], drawstyle: Any = None) -> None:
-    every = max(1, len(x) // MARKS)
-    panel.plot(x, y, label=label, **look, drawstyle=drawstyle, markevery=every, markersize=4, linewidth=1.4)
-
-
-def _label_steps(panel: Axes) -> None:
-    panel.set_xlabel("environment steps")
-    panel.xaxis.set_major_formatter(EngFormatter(sep=""))
-
-
+@styled
 def stability(table: pd.DataFrame, methods: Sequence[str], repetitions: int = REPETITIONS) -> bytes:
     """
-    Draw the share of runs that reach at least a reward, with its 95 % band: of all runs, and closer of the better half.
+    Draw the share of runs that reach at least a reward, with its 95 % band, over the rewards at which methods differ.
 
     :param table: the runs' scores
     :param methods: the methods, in the legend's order
@@ -131,69 +37,82 @@ def stability(table: pd.DataFrame, methods: Sequence[str], repetitions: int = RE
     :return: the picture, as PNG
     """
     tasks = list(dict.fromkeys(table["task"]))
-    # A task's two panels stand beside each other
-    figure, grid = panels(2 * len(tasks), columns=2)
-    for task, whole, closer in zip(tasks, grid[::2], grid[1::2], strict=True):
+    figure, grid = panels(len(tasks), columns=min(len(tasks), 2), size=(5.0, 3.4))
+    for task, panel in zip(tasks, grid, strict=True):
         runs = table[table["task"] == task]
-        levels = np.unique(runs["score"])
+        levels, shares = np.unique(runs["score"]), []
         for method, look in styles(methods).items():
             cells = cells_of(runs[runs["method"] == method], "score")
             if not cells:
                 continue
             share, band = bootstrap(lambda scores, levels=levels: share_reaching(scores, levels), [cells], repetitions)
-            for axes in (whole, closer):
-                _line(axes, levels, 100 * share, method, look, drawstyle="steps-pre")
-                if band is not None:
-                    axes.fill_between(
-                        levels, 100 * band[0], 100 * band[1], step="pre", color=look["color"], alpha=0.12, linewidth=0
-                    )
-        whole.set(title=f"{task}: all runs", xlabel="final reward", ylabel="runs that reach it, %", ylim=(-3, 103))
-        median = float(runs["score"].median())
-        margin = 0.03 * (levels[-1] - median) or 1.0
-        closer.set(title="the range of the better half", xlabel="final reward", xlim=(median - margin, levels[-1] + margin))
+            shares.append(share)
+            draw_line(panel, levels, 100 * share, method, look, drawstyle="steps-pre")
+            if band is not None:
+                panel.fill_between(levels, 100 * band[0], 100 * band[1], step="pre", color=look["color"], **BAND)
+        panel.set(title=task, xlabel="final reward", ylim=(-3, 103), xlim=differing_range(levels, np.array(shares)))
+    for panel in grid[::2]:
+        panel.set_ylabel("runs that reach it, %")
     legend(figure, grid)
     return png(figure)
 
 
-def _looks(study: Study) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """List the configurations that were run with a look: colour and marker by the first axis, line by all others."""
-    places = sorted({study.place(record.settings): record.settings for record in study.records}.items())
-    rests = list(dict.fromkeys(numbers[1:] for numbers, _ in places))
-    colors = colormaps["viridis"](np.linspace(0.0, 0.8, len(next(iter(study.axes.values())))))
-    looks = []
-    for numbers, settings in places:
-        line = rests.index(numbers[1:]) if len(study.axes) > 1 else numbers[0]
-        look = dict(color=colors[numbers[0]], marker=MARKERS[numbers[0] % len(MARKERS)])
-        looks.append((settings, look | dict(linestyle=LINE_STYLES[line % len(LINE_STYLES)])))
-    return looks
+def differing_range(levels: np.ndarray, shares: np.ndarray) -> tuple[float, float]:
+    """
+    Return the range of rewards at which methods differ.
+
+    :param levels: rewards, ascending (L)
+    :param shares: for each method, the share of its runs that reach them (M, L)
+    :return: the range, with a margin; that of all rewards where methods never differ
+    """
+    differs = np.flatnonzero(shares.max(axis=0) - shares.min(axis=0) > DIFFERENCE)
+    first = levels[differs[0]] if len(differs) > 0 else levels[0]
+    margin = 0.03 * float(levels[-1] - first) or 1.0
+    return float(first) - margin, float(levels[-1]) + margin
 
 
+@styled
 def sensitivity(study: Study, task: str) -> bytes:
     """
-    Draw a task's learning curves for each configuration: a panel per method, a line per configuration, means over seeds.
+    Draw a task's learning curves for each configuration, means over seeds: a column of panels for each method, a row for each
+    combination of values of all axes but the last, and a line for each value of the last axis.
 
     :param study: the study, with an axis
     :param task: the task
     :return: the picture, as PNG
     """
+    records = [record for record in study.records if record.task == task]
     floor, grid = floors(study.records)[task], evaluation_grid(study.records, task)
-    ran = {record.method for record in study.records if record.task == task}
-    methods = [method for method in study.methods if method in ran]
-    figure, drawn = panels(len(methods))
-    for method, panel in zip(methods, drawn, strict=True):
-        for settings, look in _looks(study):
-            records = [
-                record for record in study.records if (record.method, record.task, record.settings) == (method, task, settings)
+    methods = [method for method in study.methods if any(record.method == method for record in records)]
+    *row_axes, (last, last_values) = study.axes.items()
+    rows = sorted({study.place(record.settings)[:-1] for record in records})
+    figure, drawn = panels(len(methods) * len(rows), columns=len(methods), size=(2.7, 2.5))
+    colors = colormaps["viridis"](np.linspace(0.0, 0.85, len(last_values)))
+    for number, panel in enumerate(drawn):
+        row, method = rows[number // len(methods)], methods[number % len(methods)]
+        for place, value in enumerate(last_values):
+            chosen = [
+                record for record in records if record.method == method and study.place(record.settings) == (*row, place)
             ]
-            if records and len(grid) > 0:
-                label = " / ".join(value_in_words(value) for value in settings.values())
-                _line(panel, grid, curves(records, floor, grid).mean(axis=0), label, look)
-        panel.set(title=method, ylabel="return")
-        _label_steps(panel)
-    legend(figure, drawn, f"{task}: {' / '.join(axis_in_words(axis) for axis in study.axes)}")
+            if chosen and len(grid) > 0:
+                look = dict(color=colors[place], linestyle=LINE_STYLES[place % len(LINE_STYLES)])
+                look["marker"] = MARKERS[place % len(MARKERS)]
+                draw_line(panel, grid, curves(chosen, floor, grid).mean(axis=0), value_in_words(value), look)
+        if number < len(methods):
+            panel.set_title(method)
+        label_steps(panel)
+        if number // len(methods) < len(rows) - 1:
+            panel.set_xlabel("")
+        if number % len(methods) == 0:
+            names = [
+                f"{axis_in_words(axis)} {value_in_words(values[at])}" for (axis, values), at in zip(row_axes, row, strict=True)
+            ]
+            panel.set_ylabel("\n".join([*names, "return"]))
+    legend(figure, drawn, f"{task}: {axis_in_words(last)}")
     return png(figure)
 
 
+@styled
 def values(study: Study, table: pd.DataFrame, task: str, repetitions: int = REPETITIONS) -> bytes:
     """
     Draw a task's final rewards against each axis: interquartile means over all runs with a value, with 95 % intervals.
@@ -204,7 +123,7 @@ def values(study: Study, table: pd.DataFrame, task: str, repetitions: int = REPE
     :param repetitions: number of bootstrap samples
     :return: the picture, as PNG
     """
-    figure, grid = panels(len(study.axes))
+    figure, grid = panels(len(study.axes), size=(4.4, 3.2))
     looks = styles(study.methods)
     for (axis, axis_values), panel in zip(study.axes.items(), grid, strict=True):
         for number, (method, look) in enumerate(looks.items()):
@@ -230,6 +149,7 @@ def values(study: Study, table: pd.DataFrame, task: str, repetitions: int = REPE
     return png(figure)
 
 
+@styled
 def final_rewards(study: Study, table: pd.DataFrame, repetitions: int = REPETITIONS) -> bytes:
     """
     Draw the final rewards of a study without axes: each run's, and their interquartile mean with its 95 % interval.
@@ -240,18 +160,19 @@ def final_rewards(study: Study, table: pd.DataFrame, repetitions: int = REPETITI
     :return: the picture, as PNG
     """
     tasks = list(dict.fromkeys(table["task"]))
-    figure, grid = panels(len(tasks))
+    methods = [method for method in study.methods if method != RANDOM] or study.methods
+    figure, grid = panels(len(tasks), share=True, size=(4.2, 0.7 + 0.36 * len(methods)))
     for task, panel in zip(tasks, grid, strict=True):
-        for place, (method, look) in enumerate(styles(study.methods).items()):
+        for place, (method, look) in enumerate(styles(methods).items()):
             runs = table[(table["task"] == task) & (table["method"] == method)]
             if runs.empty:
                 continue
             found = estimate(interquartile_mean, [cells_of(runs, "score")], repetitions)
             panel.plot(runs["score"], [place + 0.3] * len(runs), "|", color=look["color"], markersize=6)
-            panel.plot(found.value, place, marker=look["marker"], color=look["color"], markersize=6)
+            panel.plot(found.value, place, marker=look["marker"], color=look["color"], markersize=7)
             if found.interval is not None:
                 panel.plot(found.interval, [place, place], color=look["color"], linewidth=2.5, alpha=0.5)
-        panel.set_yticks(range(len(study.methods)), study.methods)
+        panel.set_yticks(range(len(methods)), methods)
         panel.set(title=task, xlabel="final reward")
     grid[0].invert_yaxis()
     return png(figure)

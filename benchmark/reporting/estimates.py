@@ -1,5 +1,7 @@
-"""Estimates with bootstrap intervals, by rliable: every statistic of the results page."""
+"""Estimates with intervals, by rliable's bootstrap or Welch's t: every statistic of the results page."""
 
+import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -29,6 +31,14 @@ class Estimate:
     value: float
     interval: tuple[float, float] | None
     runs: int
+
+    def negative(self) -> "Estimate":
+        """
+        Return the estimate of the opposite number, such as a loss in place of a gain.
+
+        :return: the estimate
+        """
+        return Estimate(-self.value, None if self.interval is None else (-self.interval[1], -self.interval[0]), self.runs)
 
     def in_words(self, form: str = ".2f") -> str:
         """
@@ -146,6 +156,38 @@ def compare(
         return np.mean([statistic(*pooled[start : start + width]) for start in range(0, len(pooled), width)], axis=0)
 
     return estimate(mean_over_tasks, groups, repetitions)
+
+
+def welch(ours: np.ndarray, theirs: np.ndarray) -> Estimate:
+    """
+    Estimate the difference between two means, with Welch's t interval, which is right for few runs and unequal variances.
+
+    :param ours: our runs (N)
+    :param theirs: their runs (M)
+    :return: our mean less theirs; without an interval where one side has one run only
+    """
+    value, runs = float(ours.mean() - theirs.mean()), min(len(ours), len(theirs))
+    if runs < 2:
+        return Estimate(value, None, runs)
+    if np.ptp(ours) == np.ptp(theirs) == 0:
+        # Without any variance, SciPy's degrees of freedom are no number
+        return Estimate(value, (value, value), runs)
+    with warnings.catch_warnings():
+        # SciPy warns where the runs of one side are equal, which is no fault of the interval
+        warnings.filterwarnings("ignore", "Precision loss", RuntimeWarning)
+        low, high = stats.ttest_ind(ours, theirs, equal_var=False).confidence_interval(0.95)
+    return Estimate(value, (float(low), float(high)), runs)
+
+
+def number_format(scores: pd.Series) -> str:
+    """
+    Return the format of numbers of the size of a task's rewards.
+
+    :param scores: the rewards
+    :return: the format with about three significant digits of their range
+    """
+    width = float(scores.max() - scores.min())
+    return f".{max(0, 3 - math.floor(math.log10(width))) if width > 0 else 1}f"
 
 
 def interquartile_mean(scores: np.ndarray) -> np.ndarray:

@@ -11,9 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from benchmark.common.records import RUNS
-from benchmark.reporting.claims import findings
-from benchmark.reporting.drawing import final_rewards, learning_curves, sensitivity, stability, values
+from benchmark.reporting.claims import NOT_THE_PAPERS, findings
+from benchmark.reporting.comparisons import experiments_section
+from benchmark.reporting.drawing import final_rewards, sensitivity, stability, values
 from benchmark.reporting.estimates import REPETITIONS
+from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, timed_runs
+from benchmark.reporting.light import light_section
+from benchmark.reporting.literature import published
 from benchmark.reporting.page import Picture, claims_section, page, pooled_section, study_section
 from benchmark.reporting.scores import Study, axis_in_words, longest, read_study, score_table
 from sb3_cgp.common.files import write_atomically
@@ -23,7 +27,19 @@ RUNTIME = Path(__file__).parent.parent / "results/runtime/runtime.json"
 PAGE = "results.md"
 FIGURES = "figures"
 FIGURES_ONLY = "--figures-only"
-STABILITY = "Stability: the share of runs, {}, that reach at least a final reward, with pointwise 95 % bands."
+CURVES = (
+    "Learning curves on {}: every seed (thin), the interquartile mean over seeds (bold), and its 95 % interval (band). "
+    "Until an offline variant's policy is trained, at the end, its curve is CEM's."
+)
+LITERATURE = " Hollow markers are mean returns from the literature, on other versions of the environment (table below)."
+MINUTES = (
+    "The same on {} by minutes of processor time, of all threads, evaluations included. A run's evaluation is placed at the "
+    "run's time times the evaluation's step divided by the run's steps, and a method's curve at the mean over its runs."
+)
+STABILITY = (
+    "Stability: the share of runs, {}, that reach at least a final reward, with pointwise 95 % bands, "
+    "from the lowest reward on at which methods are more than 10 % apart."
+)
 
 
 def study_folders(out: Path = FOLDER) -> list[Path]:
@@ -58,9 +74,11 @@ def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPE
     for picture in [*together, *itertools.chain(*pictures)]:
         write_atomically(out / picture.path, picture.content)
     if with_page:
-        found = findings(score_table(in_earnest), read_runtime(), repetitions)
+        papers = [study for study in in_earnest if study.facts["experiment"] not in NOT_THE_PAPERS]
+        found = findings(score_table(papers), read_runtime(), repetitions)
         command = command_line(folders, out, repetitions)
-        sections = [f"`{command}` writes this page.", claims_section(found)]
+        answers = [light_section(studies), experiments_section(in_earnest, repetitions)]
+        sections = [f"`{command}` writes this page.", claims_section(found), *filter(None, answers)]
         sections += [pooled_section(picture, f"{command} {FIGURES_ONLY}") for picture in together]
         for study, own in zip(studies, pictures, strict=True):
             # A study's figures depend on nothing else
@@ -120,28 +138,45 @@ def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
         return Picture(f"{FIGURES}/{study.name}/{name}.png", caption, content)
 
     if not study.axes:
-        curve = (
-            "Learning curves on {}: mean and range over seeds (left), interquartile mean and 95 % interval (right). "
-            "Until an offline variant's policy is trained, at the end, its curve is CEM's."
-        )
+        pictures = []
+        for task in study.tasks:
+            drawn = curves_by_steps(study, task, repetitions)
+            caption = CURVES.format(task) + LITERATURE * bool(published(task, study.facts["steps"]))
+            pictures.append(picture("learning_curves", caption, drawn, task))
+            if timed_runs(study, task)[0]:
+                drawn = curves_by_minutes(study, task, repetitions)
+                pictures.append(picture("learning_curves_by_minutes", minutes_caption(study, task), drawn, task))
         final = "Final rewards: interquartile mean, its 95 % interval, and every run as a stroke."
-        return [
-            *(
-                picture("learning_curves", curve.format(task), learning_curves(study, task, repetitions), task)
-                for task in study.tasks
-            ),
-            picture("final_rewards", final, final_rewards(study, table, repetitions)),
-        ]
+        return [*pictures, picture("final_rewards", final, final_rewards(study, table, repetitions))]
 
     axes = " and ".join(axis_in_words(axis) for axis in study.axes)
     caption = STABILITY.format("of all configurations and seeds")
     pictures = [picture("stability", caption, stability(table, study.methods, repetitions))]
     for task in study.tasks:
-        lines = f"Sensitivity to {axes} on {task}: learning curves, means over seeds."
+        lines = f"Sensitivity to {axes} on {task}: learning curves, means over seeds, on one vertical scale."
         pictures.append(picture("sensitivity", lines, sensitivity(study, task), task))
         points = f"Final rewards on {task} by {axes}: interquartile means over all runs with a value, and 95 % intervals."
         pictures.append(picture("values", points, values(study, table, task, repetitions), task))
     return pictures
+
+
+def minutes_caption(study: Study, task: str) -> str:
+    """
+    Return the caption of learning curves by minutes.
+
+    :param study: the study
+    :param task: the task
+    :return: the caption, with the number of runs that are left out, and a warning if the runs were on several machines
+    """
+    left_out = sum(record.task == task for record in study.records) - len(timed_runs(study, task)[0])
+    machines = [command["machine"] for command in study.facts["commands"]]
+    processors = dict.fromkeys(str(machine["gpu"] or machine["cpu"]) for machine in machines)
+    sentences = [MINUTES.format(task)]
+    if left_out:
+        sentences.append(f"Left out: {left_out} run{'s' * (left_out > 1)} without a recorded time.")
+    if len(processors) > 1:
+        sentences.append(f"The runs were on different machines ({', '.join(processors)}), so their times differ.")
+    return " ".join(sentences)
 
 
 def task_names(tasks: Sequence[str]) -> dict[str, str]:

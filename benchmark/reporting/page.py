@@ -1,6 +1,5 @@
 """The results page of sweeps: claims, tables and figures, with the commands that make them."""
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,15 +12,15 @@ from benchmark.common.provenance import conditions_in_words
 from benchmark.common.records import FINAL_EPISODES
 from benchmark.common.tables import markdown_table
 from benchmark.reporting.claims import RULES
+from benchmark.reporting.comparisons import DIFFERENCES_RULE, differences_table, improvement_table
 from benchmark.reporting.estimates import (
     REPETITIONS,
-    Estimate,
     cells_of,
-    compare,
     estimate,
     interquartile_mean,
-    probability_of_improvement,
+    number_format,
 )
+from benchmark.reporting.literature import literature_section
 from benchmark.reporting.scores import FAILURE_RULE, LENGTH_RULE, Study, failed, score_table
 from benchmark.reporting.verdicts import OURS, Finding
 
@@ -37,7 +36,9 @@ The time of inference was measured separately, by `python -m benchmark.runtime`.
 
 Intervals are 95 % percentile bootstrap intervals by rliable; runs are drawn within each task and configuration. Few runs make
 them too narrow: on normally distributed rewards, the interval of an interquartile mean of 2, 3, 4, 5, 10 runs contains the
-true value in 52, 72, 88, 89, 93 % of the cases. There is no interval where a configuration has one run only."""
+true value in 52, 72, 88, 89, 93 % of the cases. There is no interval where a configuration has one run only.
+
+{DIFFERENCES_RULE}"""
 # Kinds of errors that are listed for a study
 ERRORS = 5
 
@@ -80,6 +81,7 @@ def study_section(study: Study, pictures: Sequence[Picture], command: str, repet
     parts = [
         f"## {facts['title']}",
         progress(study),
+        *ended_runs(study),
         f"{facts['settings_in_words']}\n\nSeeds {', '.join(map(str, facts['seeds']))}; {facts['steps']:,} steps, evaluated "
         f"every {facts['evaluation_interval']:,} by {facts['evaluation_episodes']} episodes.",
         *commands_in_words(facts["commands"]),
@@ -87,9 +89,14 @@ def study_section(study: Study, pictures: Sequence[Picture], command: str, repet
     if study.records:
         parts += [picture.in_words(command) for picture in pictures]
         parts += ["### Final rewards", *reward_tables(table, study, repetitions)]
+        differences = "" if study.axes else differences_table(table, study.methods, repetitions)
+        if differences:
+            parts += ["### Differences between methods", differences]
         improvement = improvement_table(table, study.methods, repetitions)
         if improvement:
             parts += [f"### How often {OURS} improves", improvement]
+        if not study.axes:
+            parts += literature_section(study.tasks, facts["steps"])
     return "\n\n".join(parts)
 
 
@@ -128,6 +135,22 @@ def progress(study: Study) -> str:
     return "\n".join(lines[:1] + [""] * bool(reasons) + lines[1:])
 
 
+def ended_runs(study: Study) -> list[str]:
+    """
+    Tabulate how many runs of an unfinished study have ended, by task and method.
+
+    :param study: the study
+    :return: the table, in Markdown; none for a study that is finished, or of which no run has ended
+    """
+    if not study.records or len(study.records) >= study.facts["runs_planned"]:
+        return []
+    number = Counter((record.task, record.method) for record in study.records)
+    tasks = dict.fromkeys([*study.facts["tasks"], *study.tasks])
+    rows = [[task, *(str(number[task, method]) for method in study.methods)] for task in tasks]
+    planned = "" if study.axes else f" ({len(study.facts['seeds'])} seeds of each are planned)"
+    return [f"Runs that have ended, by task and method{planned}:", markdown_table(["task", *study.methods], rows)]
+
+
 def reward_tables(table: pd.DataFrame, study: Study, repetitions: int = REPETITIONS) -> list[str]:
     """
     Tabulate final rewards: by method, and, in a section that is folded, by configuration.
@@ -149,52 +172,13 @@ def _reward_table(table: pd.DataFrame, columns: list[str], study: Study, repetit
     groups = [([str(name) for name in names], runs) for names, runs in table.groupby(columns)]
     rows = []
     for names, runs in sorted(groups, key=lambda group: [first[name] for name in group[0]]):
-        form = _form(table[table["task"] == names[0]]["score"])
+        form = number_format(table[table["task"] == names[0]]["score"])
         found = estimate(interquartile_mean, [cells_of(runs, "score")], repetitions)
         scores = runs["score"]
         numbers = [f"{value:{form}}" for value in (scores.mean(), scores.min(), scores.max())]
         rows.append([*names, found.in_words(form), *numbers, str(len(runs)), str(runs["failed"].sum())])
     header = [*columns, "interquartile mean (95 % interval)", "mean", "lowest", "highest", "runs", "failed"]
     return markdown_table(header, rows)
-
-
-def _form(scores: pd.Series) -> str:
-    """Return the number format for the range of a task's rewards: about three significant digits."""
-    width = float(scores.max() - scores.min())
-    return f".{max(0, 3 - math.floor(math.log10(width))) if width > 0 else 1}f"
-
-
-def improvement_table(table: pd.DataFrame, methods: Sequence[str], repetitions: int = REPETITIONS) -> str:
-    """
-    Tabulate the probability that CGP improves on each other method.
-
-    :param table: the runs' scores
-    :param methods: the methods, in the rows' order
-    :param repetitions: number of bootstrap samples
-    :return: the table, in Markdown; empty without CGP or without others
-    """
-    tasks = list(dict.fromkeys(table["task"]))
-    rows = []
-    for method in methods:
-        scopes = [table[table["task"] == task] for task in tasks] + [table] * (len(tasks) > 1)
-        found = [
-            compare(scope, (OURS, method), probability_of_improvement, "score", repetitions) if method != OURS else None
-            for scope in scopes
-        ]
-        if any(found):
-            rows.append([method, *(_cell(each) for each in found)])
-    if not rows:
-        return ""
-    header = [f"{OURS} against", *tasks, *["all tasks"] * (len(tasks) > 1)]
-    note = (
-        "The probability that a run of it scores more than one of the other method, both of a configuration that both ran, "
-        "with ties as half (95 % interval)."
-    )
-    return f"{markdown_table(header, rows)}\n\n{note}"
-
-
-def _cell(found: Estimate | None) -> str:
-    return "-" if found is None else found.in_words()
 
 
 def _first_line(text: str) -> str:

@@ -86,6 +86,30 @@ def evaluate(run: Run, model: BaseAlgorithm, env: VecEnv, episodes: int) -> list
     return [float(episode_return) for episode_return in cast(list[float], returns)]
 
 
+def gradient_steps(model: BaseAlgorithm) -> int | None:
+    """
+    Return the number of gradient steps that a model has taken.
+
+    :param model: the model
+    :return: those of the critics; None for an on-policy algorithm, which counts epochs
+    """
+    # SB3 has no other count, and saves it with the model
+    return int(model._n_updates) if isinstance(model, OffPolicyAlgorithm) else None
+
+
+def length_in_words(record: dict[str, Any]) -> str:
+    """
+    Return the length of a training, as in "4,000 steps, 3,600 gradient steps".
+
+    :param record: the run's record
+    :return: environment steps and gradient steps
+    """
+    number = record["gradient_steps"]
+    if number == 0:
+        return f"{record['steps']:,} steps, no gradient step: nothing was learnt"
+    return f"{record['steps']:,} steps" + ("" if number is None else f", {number:,} gradient steps")
+
+
 def build_record(run: Run, model: BaseAlgorithm, curve: Curve, returns: list[float], seed: int) -> dict[str, Any]:
     """
     Return the record of a report, with versions and hardware.
@@ -102,6 +126,7 @@ def build_record(run: Run, model: BaseAlgorithm, curve: Curve, returns: list[flo
         "env": run.env_name.gym_id,
         "seed": run.read_yaml("args.yml").get("seed"),
         "steps": model.num_timesteps,
+        "gradient_steps": gradient_steps(model),
         "hyperparameters": run.read_yaml("config.yml"),
         "final": {
             "episodes": len(returns),
@@ -153,7 +178,7 @@ def summary(run: Run, record: dict[str, Any]) -> str:
     final = record["final"]
     return "\n".join(
         [
-            f"{record['algo']} on {record['env']}, seed {record['seed']}, after {record['steps']:,} steps",
+            f"{record['algo']} on {record['env']}, seed {record['seed']}, after {length_in_words(record)}",
             f"  final evaluation  {final['mean']:.1f} ± {final['std']:.1f} over {final['episodes']} episodes",
             f"  model             {run.model_path}",
             f"  logs              {run.folder}",

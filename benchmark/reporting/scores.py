@@ -13,9 +13,7 @@ import pandas as pd
 
 from benchmark.common.records import STUDY, Record, read_records
 
-LENGTH_RULE = (
-    "Where an experiment was run on a task with several numbers of environment steps, the longest runs alone count for them."
-)
+LENGTH_RULE = "Shorter runs of an experiment on a task are left out of them where longer ones have all of their methods."
 FAILURE_RULE = (
     "A run that failed counts with the lowest return that any evaluation of any run on its task reached, and its learning "
     "curve continues at that return from its failure on."
@@ -104,15 +102,20 @@ def longest(studies: Sequence[Study]) -> list[Study]:
     Return the studies without shorter trial runs, which must not weigh as much as the longest ones.
 
     :param studies: the studies
-    :return: the studies with the longest runs of each experiment on each task; those that have none of these are left out
+    :return: the studies without such runs, as :data:`LENGTH_RULE` defines them; those that have no others are left out
     """
-    steps: dict[tuple[str, str], int] = {}
+    methods: dict[tuple[str, str], dict[int, set[str]]] = {}
     for record in (record for study in studies for record in study.records):
-        sort = record.experiment, record.task
-        steps[sort] = max(steps.get(sort, 0), record.steps)
+        by_steps = methods.setdefault((record.experiment, record.task), {})
+        by_steps.setdefault(record.steps, set()).add(record.method)
+
+    def is_trial(record: Record) -> bool:
+        by_steps = methods[record.experiment, record.task]
+        return any(steps > record.steps and by_steps[record.steps] <= longer for steps, longer in by_steps.items())
+
     kept = []
     for study in studies:
-        records = [record for record in study.records if record.steps == steps[record.experiment, record.task]]
+        records = [record for record in study.records if not is_trial(record)]
         if records:
             kept.append(replace(study, records=records))
     return kept

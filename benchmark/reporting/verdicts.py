@@ -8,6 +8,8 @@ from benchmark.reporting.estimates import FEWEST_RUNS, Estimate
 
 # The method that the claims are about
 OURS = "CGP-Online"
+# The same with the light setting of CEM, which starts from the actor
+LIGHT = "CGP-Light"
 SUPPORTED, CONTRADICTED = "supported", "contradicted"
 NOT_DECIDED, NO_DATA = "not decided by these data", "no data"
 

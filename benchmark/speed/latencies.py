@@ -7,13 +7,18 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import onnxruntime
 
 from benchmark.common.provenance import conditions_in_words
 from benchmark.common.tables import markdown_table
 from benchmark.speed.timing import interleaved, ratio, summary
 from sb3_cgp import CGP
+from sb3_cgp.common.extras import import_from_extra
 
+# Before the first measurement
+onnxruntime, *_ = (
+    import_from_extra(name, "export", "A measurement of exports")
+    for name in ("onnxruntime", "onnx", "onnxscript", "safetensors")
+)
 PREDICT, WEIGHTS, ONNX = "`predict`", "`load_weights`", "onnxruntime"
 NOTES = """\
 Microseconds per action on {env}, one observation at a time, of an untrained policy of the default size: medians of {rounds}

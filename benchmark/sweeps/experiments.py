@@ -4,7 +4,9 @@ Sweeps as data: the files of ``hyperparams/sweeps`` with the changes of a comman
 A file's keys are the fields of :class:`~benchmark.sweeps.sweep_files.SweepFile`.
 """
 
+import functools
 import itertools
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any
 
 from huggingface_sb3 import EnvironmentName
 
+from benchmark.common.zoo import read_entry, shortened_warm_up
 from benchmark.sweeps.hyperparameters import problems
 from benchmark.sweeps.runs import Run, checkpoint_interval
 from benchmark.sweeps.sweep_files import Hyperparams, Inclusion, Method, Packages, SweepFile
@@ -68,10 +71,9 @@ class Sweep:
     def _run(self, method: str, task: str, settings: dict[str, Any], seed: int) -> Run:
         file = self.file
         hyperparams = self.methods[method].hyperparams
-        if "learning_starts" in hyperparams:
-            # A shortened run learns, too
-            hyperparams = hyperparams | {"learning_starts": min(hyperparams["learning_starts"], file.steps // 10)}
-        hyperparams = hyperparams | file.hyperparams
+        algo, is_tuned = self.methods[method].algo, self.methods[method].tuned
+        entry = tuned_entry(algo, task) if is_tuned else {}
+        hyperparams = hyperparams | shortened_warm_up(algo, entry | hyperparams, file.steps) | file.hyperparams
         for axis, value in settings.items():
             hyperparams = hyperparams | file.axes[axis].hyperparams(axis, value, method)
         return Run(
@@ -79,15 +81,30 @@ class Sweep:
             task,
             settings,
             seed,
-            self.methods[method].algo,
+            algo,
             hyperparams,
-            self.methods[method].tuned,
+            is_tuned,
             file.steps,
             file.evaluation_interval,
             file.evaluation_episodes,
             file.checkpoint_interval or checkpoint_interval(file.steps),
             file.gym_packages,
         )
+
+
+@functools.cache
+def tuned_entry(algo: str, task: str) -> Hyperparams:
+    """
+    Return the hyperparameters that a tuned method starts from.
+
+    :param algo: the algorithm's name in rl_zoo3
+    :param task: the environment, as it is registered
+    :return: the entry of the algorithm's YAML file; empty if it has none, which the construction of a model refuses
+    """
+    try:
+        return read_entry(algo, task)
+    except ValueError:
+        return {}
 
 
 def sweeps_folder() -> Path:
@@ -109,9 +126,14 @@ def find_sweep_file(name: str) -> Path:
     """
     path = Path(name) if name.endswith((".yml", ".yaml")) else sweeps_folder() / f"{name}.yml"
     if not path.is_file() or path.name == METHODS_FILE:
-        known = sorted(each.stem for each in sweeps_folder().glob("*.yml") if each.name != METHODS_FILE)
+        known = sorted((each.stem for each in sweeps_folder().glob("*.yml") if each.name != METHODS_FILE), key=_with_numbers)
         raise SweepError(name, "", f"no such sweep: must be one of {', '.join(known)}, or the path of a .yml file")
     return path
+
+
+def _with_numbers(name: str) -> list[str | int]:
+    """Return a key by which e2 comes before e10."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
 
 
 def included_sweeps(name: str) -> list[str]:

@@ -13,6 +13,8 @@ from sqlalchemy import create_engine, event
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
+from sb3_cgp.common.extras import how_to_install
+
 Result = TypeVar("Result")
 
 # Errors of the database, and not of the call. Optuna does not convert all of SQLAlchemy's errors.
@@ -59,6 +61,9 @@ def _read_url(url: str) -> URL:
         if not is_in_memory:
             # Imports the driver
             create_engine(database)
+    except ModuleNotFoundError as error:
+        extra = f" It is in the extra `sweeps`: {how_to_install('sweeps')}" if error.name == "psycopg2" else ""
+        raise ValueError(f"The value of `storage` is {url!r}, and its driver {error.name} is not installed.{extra}") from error
     except (ArgumentError, ImportError) as error:
         raise ValueError(f"The value of `storage` is {url!r}, but must be a database's URL: {error}") from error
     if is_in_memory:

@@ -98,7 +98,9 @@ class Ledger(StudyView):
         for run in runs:
             was, now = present.get(run.key), json.loads(json.dumps(asdict(run)))
             if was is not None and was != now:
-                name = next(name for name in now if was.get(name) != now[name])
+                # Hyperparameters last, as the number of random steps may follow from the number of steps
+                names = sorted(now, key=lambda name: name == "hyperparams")
+                name = next(name for name in names if was.get(name) != now[name])
                 raise self._refusal(name, f"was {was.get(name)!r} and is now {now[name]!r} for {run.key}")
         for name in ("steps", "evaluation_interval", "evaluation_episodes") if trials else ():
             before, after = trials[0].user_attrs[RUN][name], getattr(runs[0], name)

@@ -4,6 +4,8 @@ import importlib
 import importlib.util
 from types import ModuleType
 
+from sb3_cgp.common.version import __version__
+
 
 def import_from_extra(name: str, extra: str, purpose: str) -> ModuleType:
     """
@@ -34,8 +36,19 @@ def require_from_extra(name: str, extra: str, purpose: str) -> None:
         raise _not_installed(name, extra, purpose)
 
 
+def how_to_install(extra: str) -> str:
+    """
+    Return the commands that install an extra. None of them needs a package index that has sb3-cgp.
+
+    :param extra: name of the extra
+    :return: the commands for a clone, and for a wheel
+    """
+    clone = f'pip install -c constraints.txt -e ".[{extra}]"'
+    wheel = f'pip install "sb3_cgp-{__version__}-py3-none-any.whl[{extra}]"'
+    return f"in a clone, {clone}; with the wheel of sb3-cgp, {wheel}"
+
+
 def _not_installed(name: str | None, extra: str, purpose: str) -> ImportError:
     return ImportError(
-        f'{purpose} needs {name}, which is not installed: pip install "sb3-cgp[{extra}]" '
-        f'(in a clone: pip install -e ".[{extra}]")'
+        f"{purpose} needs {name}, which is not installed. It is in the extra `{extra}`: {how_to_install(extra)}"
     )

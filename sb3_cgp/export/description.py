@@ -1,36 +1,36 @@
 """
-The description of an exported policy, ``policy.json``: its format, and the network and spaces that it describes.
+The description of an exported policy, ``policy.json``: its format, and the network that it describes.
 
 A description is data from an unknown source. A class is one of a fixed list, by its name, and sizes are checked before memory
-of that size is allocated.
+of that size is allocated (those of the spaces in :mod:`sb3_cgp.export.boxes`).
 """
 
-from typing import Any
+from typing import Any, TypeAlias
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import FlattenExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.td3.policies import Actor
 from torch import nn
 
 from sb3_cgp.common.rules import require, require_choice, require_count
+from sb3_cgp.export.boxes import ObservationSpace, take_fields
 
 FORMAT = "sb3-cgp policy"
-FORMAT_VERSION = 1
+# Version 1 had no Dict observations, and no keys of what is normalised
+FORMAT_VERSION = 2
+READABLE_VERSIONS = (1, FORMAT_VERSION)
 ONNX_FILE, TENSORS_FILE, DESCRIPTION_FILE = "policy.onnx", "policy.safetensors", "policy.json"
-MEAN, VARIANCE = "normalization.mean", "normalization.variance"
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     cls.__name__: cls
     for cls in (nn.ReLU, nn.Tanh, nn.ELU, nn.LeakyReLU, nn.GELU, nn.SiLU, nn.Mish, nn.SELU, nn.Sigmoid, nn.Softplus)
 }
-EXTRACTORS: dict[str, type[FlattenExtractor] | type[NatureCNN]] = {cls.__name__: cls for cls in (FlattenExtractor, NatureCNN)}
+Extractor: TypeAlias = type[FlattenExtractor] | type[NatureCNN] | type[CombinedExtractor]
+EXTRACTORS: dict[str, Extractor] = {cls.__name__: cls for cls in (FlattenExtractor, NatureCNN, CombinedExtractor)}
+# The arguments of an extractor that an export may set
+WIDTHS = {"NatureCNN": "features_dim", "CombinedExtractor": "cnn_output_dim"}
 EXPORTABLE_INFERENCES = ("actor", "averaged_actor")
-OBSERVATION_DTYPES = ("float32", "float64", "uint8", "int8", "int16", "int32", "int64")
-ACTION_DTYPES = ("float32", "float64")
-# Larger sizes are refused, as they would exhaust the memory
-LARGEST_SPACE = 2**24
 MOST_LAYERS = 1_000
 
 
@@ -44,8 +44,9 @@ def check_description(description: Any) -> None:
     keys = ("format", "format_version", "versions", "observation_space", "action_space", "network", "inference")
     kind, version, versions, *_, inference, _, sha256 = take_fields(description, "policy", (*keys, "normalization", "sha256"))
     require(kind == FORMAT, "format", kind, repr(FORMAT))
-    is_known = type(version) is int and version == FORMAT_VERSION
-    require(is_known, "format_version", version, f"{FORMAT_VERSION} for this version of sb3-cgp; a newer one may read it")
+    is_known = type(version) is int and version in READABLE_VERSIONS
+    allowed = f"{' or '.join(map(str, READABLE_VERSIONS))} for this version of sb3-cgp; a newer one may read it"
+    require(is_known, "format_version", version, allowed)
     for name, value, names in (
         ("versions", versions, ("sb3_cgp", "torch")),
         ("sha256", sha256, (ONNX_FILE, TENSORS_FILE)),
@@ -55,66 +56,7 @@ def check_description(description: Any) -> None:
     require_choice("inference", inference, EXPORTABLE_INFERENCES)
 
 
-def describe_box(space: spaces.Box) -> dict[str, Any]:
-    """
-    Describe a box in plain JSON.
-
-    :param space: the box
-    :return: the shape, the data type, and the lower and upper bounds: one number if all are equal, otherwise a list of all in
-        C order; None for an infinite bound
-    """
-    bounds = {}
-    for name, values in (("low", space.low), ("high", space.high)):
-        numbers = [number if np.isfinite(number) else None for number in values.ravel().tolist()]
-        bounds[name] = numbers[0] if len(set(numbers)) == 1 else numbers
-    return {"shape": list(space.shape), "dtype": space.dtype.name, **bounds}
-
-
-def take_fields(value: Any, name: str, keys: tuple[str, ...]) -> list[Any]:
-    """
-    Return the values of a JSON object that has exactly the given keys.
-
-    :param value: the object
-    :param name: its name in errors
-    :param keys: its keys
-    :return: the values in the order of the keys
-    :raises ValueError: if the value is not an object, or has other keys
-    """
-    require(isinstance(value, dict) and set(value) == set(keys), name, value, f"an object of {', '.join(keys)}")
-    return [value[key] for key in keys]
-
-
-def read_box(value: Any, name: str, dtypes: tuple[str, ...]) -> spaces.Box:
-    """
-    Create the box that :func:`describe_box` described.
-
-    :param value: the description
-    :param name: its name in errors
-    :param dtypes: the data types that are allowed
-    :return: the box
-    :raises ValueError: naming an entry that is not allowed
-    """
-    shape, dtype, low, high = take_fields(value, name, ("shape", "dtype", "low", "high"))
-    require(isinstance(shape, list), f"{name}.shape", shape, "a list")
-    size = 1
-    for length in shape:
-        require_count(f"{name}.shape", length)
-        size *= length
-        require(size <= LARGEST_SPACE, f"{name}.shape", shape, f"of at most {LARGEST_SPACE} elements")
-    require_choice(f"{name}.dtype", dtype, dtypes)
-    bounds = []
-    for bound, values, infinity in (("low", low, -np.inf), ("high", high, np.inf)):
-        numbers = values if isinstance(values, list) else [values] * size
-        require(len(numbers) == size, f"{name}.{bound}", values, f"a number or null, or {size} of them")
-        # Not isinstance, because True is an int, too
-        are_numbers = all(number is None or type(number) in (int, float) for number in numbers)
-        require(are_numbers, f"{name}.{bound}", values, "a number or null, or a list of them")
-        bounds.append(np.array([infinity if number is None else number for number in numbers], dtype).reshape(shape))
-    require(bool(np.all(bounds[0] <= bounds[1])), name, value, "of low <= high")
-    return spaces.Box(bounds[0], bounds[1], tuple(shape), np.dtype(dtype).type)
-
-
-def make_actor(network: Any, observation_space: spaces.Box, action_space: spaces.Box) -> Actor:
+def make_actor(network: Any, observation_space: ObservationSpace, action_space: spaces.Box) -> Actor:
     """
     Create the actor on PyTorch's meta device, without memory for its parameters.
 
@@ -131,17 +73,12 @@ def make_actor(network: Any, observation_space: spaces.Box, action_space: spaces
     for width in net_arch:
         require_count("net_arch", width)
     require_choice("activation_fn", activation_fn, ACTIVATIONS)
-    require_choice("features_extractor", extractor, EXTRACTORS)
     require(isinstance(normalize_images, bool), "normalize_images", normalize_images, "true or false")
-    allowed = {"features_dim", "normalized_image"} if EXTRACTORS[extractor] is NatureCNN else set()
-    are_allowed = isinstance(kwargs, dict) and set(kwargs) <= allowed
-    require(are_allowed, "features_extractor_kwargs", kwargs, f"an object of no other keys than {sorted(allowed)}")
-    require_count("features_dim", kwargs.get("features_dim", 1))
-    normalized_image = kwargs.get("normalized_image", False)
-    require(isinstance(normalized_image, bool), "normalized_image", normalized_image, "true or false")
+    _check_extractor(extractor, kwargs, observation_space)
     try:
         with th.device("meta"):
-            features_extractor = EXTRACTORS[extractor](observation_space, **kwargs)
+            # The check above has found the kind of space that this class takes
+            features_extractor = EXTRACTORS[extractor](observation_space, **kwargs)  # type: ignore[arg-type]
             return Actor(
                 observation_space,
                 action_space,
@@ -151,6 +88,21 @@ def make_actor(network: Any, observation_space: spaces.Box, action_space: spaces
                 ACTIVATIONS[activation_fn],
                 normalize_images,
             )
-    # The errors of PyTorch and SB3 for sizes that do not fit together
-    except (AssertionError, RuntimeError) as error:
+    # The errors of PyTorch and SB3 for sizes that do not fit together, and for keys that name an attribute of `ModuleDict`
+    except (AssertionError, KeyError, RuntimeError) as error:
         raise ValueError(f"The value of `network` is {network!r}, which does not fit the spaces: {error}") from error
+
+
+def _check_extractor(extractor: Any, kwargs: Any, observation_space: ObservationSpace) -> None:
+    """Check the features extractor's name and arguments."""
+    is_dict = isinstance(observation_space, spaces.Dict)
+    fitting = [name for name, cls in EXTRACTORS.items() if (cls is CombinedExtractor) == is_dict]
+    require_choice("features_extractor", extractor, fitting)
+    width = WIDTHS.get(extractor)
+    allowed = {"normalized_image"} | {width} if width is not None else set()
+    are_allowed = isinstance(kwargs, dict) and set(kwargs) <= allowed
+    require(are_allowed, "features_extractor_kwargs", kwargs, f"an object of no other keys than {sorted(allowed)}")
+    if width is not None:
+        require_count(width, kwargs.get(width, 1))
+    normalized_image = kwargs.get("normalized_image", False)
+    require(isinstance(normalized_image, bool), "normalized_image", normalized_image, "true or false")

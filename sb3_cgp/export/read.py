@@ -1,9 +1,10 @@
 """
 Loading an exported policy from safetensors and JSON, which hold data and no code.
 
-The files may come from an unknown source, see :mod:`sb3_cgp.export.description`.
+The files may come from an unknown source, see :mod:`sb3_cgp.export.description` and :mod:`sb3_cgp.export.boxes`.
 """
 
+import errno
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
@@ -11,25 +12,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch as th
 
 from sb3_cgp.common.extras import import_from_extra
-from sb3_cgp.common.rules import require, require_number
 from sb3_cgp.common.spaces import check_action_space
-from sb3_cgp.export.description import (
-    ACTION_DTYPES,
-    DESCRIPTION_FILE,
-    MEAN,
-    OBSERVATION_DTYPES,
-    ONNX_FILE,
-    TENSORS_FILE,
-    VARIANCE,
-    check_description,
-    make_actor,
-    read_box,
-    take_fields,
-)
+from sb3_cgp.export.boxes import ACTION_DTYPES, boxes_of, read_box, read_observations
+from sb3_cgp.export.description import DESCRIPTION_FILE, ONNX_FILE, TENSORS_FILE, check_description, make_actor
+from sb3_cgp.export.normalization import make_normalizers, normalized_names, statistics_names
 from sb3_cgp.export.policy import ExportedNetwork, ExportedPolicy
 
 # For the error where a package of the extra is missing
@@ -60,26 +49,20 @@ def build(description: Mapping[str, Any], tensors: Mapping[str, th.Tensor]) -> E
     :return: the policy
     :raises ValueError: naming an entry or tensor that is not allowed, or does not fit the others
     """
-    observation_space = read_box(description["observation_space"], "observation_space", OBSERVATION_DTYPES)
+    observation_space = read_observations(description["observation_space"], "observation_space")
     action_space = read_box(description["action_space"], "action_space", ACTION_DTYPES)
     check_action_space(action_space)
     actor = make_actor(description["network"], observation_space, action_space)
+    normalization = description["normalization"]
+    normalized = normalized_names(normalization, observation_space, description["format_version"])
     expected: dict[str, th.Tensor] = {}
-    normalization = None
-    if description["normalization"] is not None:
-        epsilon, clip_obs = take_fields(description["normalization"], "normalization", ("epsilon", "clip_obs"))
-        require_number("epsilon", epsilon)
-        if clip_obs is not None:
-            require_number("clip_obs", clip_obs)
-        statistics = th.empty(observation_space.shape, dtype=th.float64, device="meta")
-        expected = {MEAN: statistics, VARIANCE: statistics}
+    for name in normalized:
+        statistics = th.empty(boxes_of(observation_space)[name].shape, dtype=th.float64, device="meta")
+        expected |= dict.fromkeys(statistics_names(observation_space, name), statistics)
     _check_tensors(tensors, expected | actor.state_dict())
-    if description["normalization"] is not None:
-        mean, variance = tensors[MEAN], tensors[VARIANCE]
-        require(bool((variance >= 0.0).all() and (variance + epsilon > 0.0).all()), VARIANCE, variance, "positive")
-        normalization = (mean, variance, epsilon, np.inf if clip_obs is None else clip_obs)
+    normalizers = make_normalizers(normalization, normalized, observation_space, tensors)
     actor.load_state_dict({name: tensors[name] for name in actor.state_dict()}, assign=True)
-    network = ExportedNetwork(actor, action_space, normalization).eval().requires_grad_(False)
+    network = ExportedNetwork(actor, observation_space, action_space, normalizers).eval().requires_grad_(False)
     return ExportedPolicy(network, observation_space, action_space, description)
 
 
@@ -108,8 +91,13 @@ def load_weights(folder: str | Path) -> ExportedPolicy:
     :return: the policy
     :raises ValueError: if a file is damaged or of another export, or an entry is not allowed; it names the file and the reason
     :raises FileNotFoundError: if ``policy.json`` or ``policy.safetensors`` is missing
+    :raises NotADirectoryError: if the folder is a file
     :raises ImportError: if safetensors is not installed
     """
+    if Path(folder).is_file():
+        raise NotADirectoryError(
+            errno.ENOTDIR, "Is a file, and no folder that `export` wrote; `load` reads a model", str(folder)
+        )
     safetensors = import_from_extra("safetensors", "export", PURPOSE)
     safetensors_torch = import_from_extra("safetensors.torch", "export", PURPOSE)
     paths = {name: Path(folder) / name for name in (DESCRIPTION_FILE, TENSORS_FILE, ONNX_FILE)}

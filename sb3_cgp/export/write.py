@@ -1,12 +1,11 @@
 """Exporting a policy: as ONNX, to act elsewhere, and as safetensors and JSON, to be loaded without pickle."""
 
+import errno
 import hashlib
 import json
-import logging
-import warnings
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import torch as th
@@ -18,6 +17,16 @@ from sb3_cgp.common.extras import import_from_extra
 from sb3_cgp.common.files import replace_all
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.version import __version__
+from sb3_cgp.export.boxes import (
+    KEYS_ALLOWED,
+    MOST_KEYS,
+    OBSERVATION,
+    ObservationSpace,
+    boxes_of,
+    describe_box,
+    describe_observations,
+    is_key,
+)
 from sb3_cgp.export.description import (
     ACTIVATIONS,
     DESCRIPTION_FILE,
@@ -25,19 +34,19 @@ from sb3_cgp.export.description import (
     EXTRACTORS,
     FORMAT,
     FORMAT_VERSION,
-    MEAN,
     ONNX_FILE,
     TENSORS_FILE,
-    VARIANCE,
-    describe_box,
 )
+from sb3_cgp.export.normalization import statistics_names
+from sb3_cgp.export.onnx_file import make_onnx, named_inputs, run_onnx
 from sb3_cgp.export.policy import ExportedPolicy
 from sb3_cgp.export.read import PURPOSE, build
 
-# The newest opset that PyTorch's exporter writes without a conversion; runtimes since 2023 read it
-OPSET = 18
 # Observations at which an export is compared with `predict`
 CHECKED_OBSERVATIONS = 16
+
+# A batch, or one for each key
+Observations: TypeAlias = np.ndarray | dict[str, np.ndarray]
 
 
 class ExportableModel(Protocol):
@@ -55,7 +64,7 @@ class ExportableModel(Protocol):
     def get_vec_normalize_env(self) -> VecNormalize | None:
         """Return the VecNormalize wrapper of the model's environment, as SB3's models do."""
 
-    def predict(self, observation: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+    def predict(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Return actions, as SB3's models do."""
 
 
@@ -66,19 +75,23 @@ def export_policy(model: ExportableModel, folder: str | Path) -> None:
     :param model: the model
     :param folder: the folder for the files; it is created if it is missing
     :raises ValueError: if the policy cannot be exported, naming the obstacle and what is allowed
+    :raises FileExistsError: if the folder is a file
     :raises ImportError: if a package of the ``export`` extra is not installed
     """
+    if Path(folder).is_file():
+        raise FileExistsError(errno.EEXIST, "Is a file, and must be a folder or a new name", str(folder))
+    # Before anything is computed
     names = ("safetensors.torch", "onnxruntime", "onnx", "onnxscript")
-    safetensors_torch, onnxruntime, *_ = (import_from_extra(name, "export", PURPOSE) for name in names)
+    safetensors_torch, *_ = (import_from_extra(name, "export", PURPOSE) for name in names)
     normalizer = _normalizer(model)
     description = _describe(model, normalizer)
     tensors = _tensors(model, normalizer)
     policy = build(description, tensors)
     observations = _observations(policy.observation_space, normalizer)
-    normalized = observations if normalizer is None else np.asarray(normalizer.normalize_obs(observations))
+    normalized = observations if normalizer is None else normalizer.normalize_obs(observations)
     expected, _ = model.predict(normalized)
     _check_same("policy", policy.predict(observations)[0], expected, policy.action_space)
-    onnx_content = _checked_onnx(policy, observations, expected, onnxruntime)
+    onnx_content = _checked_onnx(policy, observations, expected)
     contents = {TENSORS_FILE: safetensors_torch.save(tensors), ONNX_FILE: onnx_content}
     description["sha256"] = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
     contents[DESCRIPTION_FILE] = (json.dumps(description, indent=2, allow_nan=False) + "\n").encode()
@@ -109,6 +122,17 @@ def _normalizer(model: ExportableModel) -> VecNormalize | None:
     return normalizer
 
 
+def _check_space(space: spaces.Space) -> None:
+    """Check that an observation space can be exported."""
+    require(isinstance(space, spaces.Box | spaces.Dict), "observation_space", space, "a Box or a Dict to be exported")
+    if isinstance(space, spaces.Dict):
+        allowed = f"of at most {MOST_KEYS} keys to be exported"
+        require(len(space.spaces) <= MOST_KEYS, "observation_space", space, allowed)
+        for key, box in space.spaces.items():
+            require(is_key(key), "observation_space", key, f"of keys that are {KEYS_ALLOWED}, to be exported")
+            require(isinstance(box, spaces.Box), f"observation_space['{key}']", box, "a Box to be exported")
+
+
 def _describe(model: ExportableModel, normalizer: VecNormalize | None) -> dict[str, Any]:
     """Return the description of the policy in plain JSON, without the checksums of the other files."""
     policy = model.policy
@@ -118,9 +142,7 @@ def _describe(model: ExportableModel, normalizer: VecNormalize | None) -> dict[s
         policy.inference,
         "'actor' or 'averaged_actor' to be exported: there is no trained actor, or it does not act (see `train_policy`)",
     )
-    require(
-        isinstance(model.observation_space, spaces.Box), "observation_space", model.observation_space, "a Box to be exported"
-    )
+    _check_space(model.observation_space)
     actor = _acting_actor(model)
     require(type(actor) is Actor, "actor", type(actor), "SB3's own to be exported")
     for name, value, allowed in (
@@ -136,12 +158,16 @@ def _describe(model: ExportableModel, normalizer: VecNormalize | None) -> dict[s
     normalization = None
     if normalizer is not None:
         clip_obs = float(normalizer.clip_obs)
-        normalization = {"epsilon": float(normalizer.epsilon), "clip_obs": clip_obs if np.isfinite(clip_obs) else None}
+        normalization = {
+            "epsilon": float(normalizer.epsilon),
+            "clip_obs": clip_obs if np.isfinite(clip_obs) else None,
+            "keys": normalizer.norm_obs_keys,
+        }
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "versions": {"sb3_cgp": __version__, "torch": th.__version__},
-        "observation_space": describe_box(model.observation_space),  # type: ignore[arg-type]
+        "observation_space": describe_observations(model.observation_space),  # type: ignore[arg-type]
         "action_space": describe_box(model.action_space),  # type: ignore[arg-type]
         "network": {
             "net_arch": [int(width) for width in actor.net_arch],
@@ -167,17 +193,28 @@ def _tensors(model: ExportableModel, normalizer: VecNormalize | None) -> dict[st
     if normalizer is not None:
         statistics = normalizer.obs_rms
         # Only the statistics of a Dict space are a dictionary
-        assert not isinstance(statistics, dict)
-        tensors[MEAN], tensors[VARIANCE] = (th.tensor(each, dtype=th.float64) for each in (statistics.mean, statistics.var))
+        by_name = statistics if isinstance(statistics, dict) else {OBSERVATION: statistics}
+        for name, each in by_name.items():
+            names = statistics_names(normalizer.venv.observation_space, name)  # type: ignore[arg-type]
+            tensors |= zip(names, (th.tensor(value, dtype=th.float64) for value in (each.mean, each.var)), strict=True)
     return tensors
 
 
-def _observations(space: spaces.Box, normalizer: VecNormalize | None) -> np.ndarray:
+def _observations(space: ObservationSpace, normalizer: VecNormalize | None) -> Observations:
     """Return random observations around the normaliser's mean, so that not all are clipped; leave the space's generator."""
     space = deepcopy(space)
     space.seed(0)
-    samples = np.stack([space.sample() for _ in range(CHECKED_OBSERVATIONS)])
-    return samples if normalizer is None else np.asarray(normalizer.unnormalize_obs(samples)).astype(space.dtype)
+    boxes = boxes_of(space)
+    samples: Observations = {
+        name: np.stack([box.sample() for _ in range(CHECKED_OBSERVATIONS)]) for name, box in boxes.items()
+    }
+    if not isinstance(space, spaces.Dict):
+        samples = samples[OBSERVATION]
+    if normalizer is not None:
+        samples = normalizer.unnormalize_obs(samples)
+    if isinstance(samples, dict):
+        return {name: each.astype(boxes[name].dtype) for name, each in samples.items()}
+    return samples.astype(boxes[OBSERVATION].dtype)
 
 
 def _check_same(what: str, actions: np.ndarray, expected: np.ndarray, space: spaces.Box) -> None:
@@ -191,42 +228,9 @@ def _check_same(what: str, actions: np.ndarray, expected: np.ndarray, space: spa
     )
 
 
-def _checked_onnx(policy: ExportedPolicy, observations: np.ndarray, expected: np.ndarray, onnxruntime: Any) -> bytes:
-    """Return a policy as ONNX, for batches of any size, after a comparison of its actions with the expected ones."""
-    registration = logging.getLogger("torch.onnx._internal.exporter._registration")
-    level = registration.level
-    # Without torchvision, the exporter warns of each of its operators; it also warns of deprecated functions of PyTorch
-    registration.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            program = th.onnx.export(
-                policy.network,
-                (th.as_tensor(observations),),
-                dynamo=True,
-                input_names=["observation"],
-                output_names=["action"],
-                dynamic_shapes=({0: th.export.Dim("batch")},),
-                opset_version=OPSET,
-                verbose=False,
-            )
-    finally:
-        registration.setLevel(level)
-    assert program is not None
-    proto = program.model_proto
-    # PyTorch writes the source of each node, with paths of the user's machine
-    proto.graph.ClearField("metadata_props")
-    for part in (
-        *proto.graph.node,
-        *proto.graph.value_info,
-        *proto.graph.initializer,
-        *proto.graph.input,
-        *proto.graph.output,
-    ):
-        part.ClearField("metadata_props")
-        part.ClearField("doc_string")
-    content = proto.SerializeToString()
-    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    actions = session.run(["action"], {"observation": observations})[0]
-    _check_same(ONNX_FILE, actions, expected, policy.action_space)
+def _checked_onnx(policy: ExportedPolicy, observations: Observations, expected: np.ndarray) -> bytes:
+    """Return a policy as ONNX, after a comparison of its actions with the expected ones."""
+    inputs = named_inputs(policy.observation_space, observations)
+    content = make_onnx(policy.network, inputs)
+    _check_same(ONNX_FILE, run_onnx(content, inputs), expected, policy.action_space)
     return content

@@ -4,8 +4,10 @@ import math
 import warnings
 from typing import Any, TypeVar
 
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 SelfLearningStartsGuard = TypeVar("SelfLearningStartsGuard", bound="LearningStartsGuard")
 
@@ -14,11 +16,15 @@ class LearningStartsGuard(OffPolicyAlgorithm):
     """
     An algorithm that warns if ``learn`` does no gradient step, for ``learning_starts`` is too large.
 
-    It warns when the training starts, or, where the length of the last episode decides, when the training has ended. It does
-    not warn of ``gradient_steps=0``, which says so itself.
+    It warns when the training starts. Where the length of the last episode decides, and episodes have no known limit, it warns
+    when the training has ended. It does not warn of ``gradient_steps=0``, which says so itself.
+
+    With ``verbose=1`` it prints how many steps are random.
     """
 
     _has_trained: bool = False
+    # The warning of this training, which is not repeated at its end
+    _has_warned: bool = False
 
     def learn(self: SelfLearningStartsGuard, *args: Any, **kwargs: Any) -> SelfLearningStartsGuard:
         """
@@ -28,10 +34,10 @@ class LearningStartsGuard(OffPolicyAlgorithm):
         :param kwargs: the algorithm's own arguments
         :return: the trained model
         """
-        self._has_trained = False
+        self._has_trained = self._has_warned = False
         result = super().learn(*args, **kwargs)
         has_ended = self._num_timesteps_at_start < self._total_timesteps <= self.num_timesteps
-        if self._trains_by_episode and has_ended and not self._has_trained:
+        if self._trains_by_episode and has_ended and not self._has_trained and not self._has_warned:
             self._warn_of_no_gradient_step(self.num_timesteps)
         return result
 
@@ -47,27 +53,64 @@ class LearningStartsGuard(OffPolicyAlgorithm):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
-        if not self._trains_by_episode and self.num_timesteps < total_timesteps:
-            assert isinstance(self.train_freq, TrainFreq)
-            steps_per_rollout = self.train_freq.frequency * self.n_envs
-            n_rollouts = math.ceil((total_timesteps - self.num_timesteps) / steps_per_rollout)
-            self._warn_of_no_gradient_step(self.num_timesteps + n_rollouts * steps_per_rollout)
+        if self.num_timesteps < total_timesteps:
+            self._print_warm_up(total_timesteps)
+            last_timestep = self._last_timestep(total_timesteps)
+            if last_timestep is not None:
+                self._warn_of_no_gradient_step(last_timestep, " at the latest" if self._trains_by_episode else "")
         return total_timesteps, callback
+
+    def _last_timestep(self, total_timesteps: int) -> int | None:
+        """Return the largest environment step at which the last rollout may end; None if no episode has a limit."""
+        assert isinstance(self.train_freq, TrainFreq)
+        if self._trains_by_episode:
+            # SB3 admits one environment only. The last rollout begins before the last step, and has whole episodes.
+            limit = _longest_episode(self.env)
+            return None if limit is None else total_timesteps - 1 + self.train_freq.frequency * limit
+        steps_per_rollout = self.train_freq.frequency * self.n_envs
+        return self.num_timesteps + steps_per_rollout * math.ceil((total_timesteps - self.num_timesteps) / steps_per_rollout)
+
+    def _print_warm_up(self, total_timesteps: int) -> None:
+        n_random = min(self.learning_starts, total_timesteps) - self.num_timesteps
+        if self.verbose >= 1 and n_random > 0:
+            n_steps = total_timesteps - self.num_timesteps
+            advice = " That is more than half: a smaller `learning_starts` trains more." if 2 * n_random > n_steps else ""
+            print(
+                f"Actions are random in the next {n_random:,} of {n_steps:,} environment steps "
+                f"(learning_starts={self.learning_starts}), without gradient steps.{advice}"
+            )
 
     @property
     def _trains_by_episode(self) -> bool:
         return isinstance(self.train_freq, TrainFreq) and self.train_freq.unit is TrainFrequencyUnit.EPISODE
 
-    def _warn_of_no_gradient_step(self, last_timestep: int) -> None:
+    def _warn_of_no_gradient_step(self, last_timestep: int, certainty: str = "") -> None:
         """Warn if the training ends at an environment step at which no gradient step has been due."""
         # SB3 trains after a rollout that ends beyond `learning_starts`
         if last_timestep > self.learning_starts or self.gradient_steps == 0:
             return
+        self._has_warned = True
+        # As in the sweeps of `benchmark`
+        start = self._num_timesteps_at_start
+        example = start + (last_timestep - start) // 10
+        has_learnt = self._n_updates > 0 and start == 0
+        continuing = ", or continue the training before this one with `reset_num_timesteps=False`" if has_learnt else ""
         warnings.warn(
-            f"Nothing is learnt: the training ends at environment step {last_timestep}, and gradient steps begin after step "
-            f"learning_starts={self.learning_starts}. Give more `total_timesteps`, or a smaller `learning_starts`.",
+            f"Nothing is learnt: the training ends at environment step {last_timestep}{certainty}, and gradient steps begin "
+            f"after step learning_starts={self.learning_starts}. Give more `total_timesteps`, or a smaller `learning_starts`, "
+            f"such as {example}{continuing}.",
             stacklevel=2,
         )
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_has_trained"]
+        return [*super()._excluded_save_params(), "_has_trained", "_has_warned"]
+
+
+def _longest_episode(env: VecEnv | None) -> int | None:
+    """Return the limit of Gymnasium's ``TimeLimit``; None if an environment lacks it, or is in a process of its own."""
+    base = None if env is None else env.unwrapped
+    if not isinstance(base, DummyVecEnv) or not all(base.env_is_wrapped(TimeLimit)):
+        return None
+    limits = [None if each.spec is None else each.spec.max_episode_steps for each in base.envs]
+    known = [limit for limit in limits if limit is not None]
+    return max(known) if len(known) == base.num_envs else None

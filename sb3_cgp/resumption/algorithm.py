@@ -30,12 +30,16 @@ SelfResumableAlgorithm = TypeVar("SelfResumableAlgorithm", bound="ResumableAlgor
 
 @contextmanager
 def _whole(path: str | Path | io.BufferedIOBase, suffix: str) -> Iterator[Any]:
-    """Open a file that appears under its name when it is complete. Add the suffix as SB3 does. Yield an open file as it is."""
+    """
+    Open a file that appears under its name when it is complete. Yield an open file as it is.
+
+    Add the suffix as SB3 does, and to the name of a folder, for which SB3 would choose a name that ``load`` does not find.
+    """
     if isinstance(path, io.BufferedIOBase):
         yield path
         return
     path = Path(path)
-    with whole_file(path if path.suffix else path.with_name(path.name + suffix)) as file:
+    with whole_file(path if path.suffix and not path.is_dir() else path.with_name(path.name + suffix)) as file:
         yield file
 
 
@@ -78,6 +82,8 @@ class ResumableAlgorithm(ResumableModel):
         lock = FolderLock(store.folder)
         if store.steps():
             lock.acquire()
+        elif store.folder.is_file() or Path(f"{store.folder}.zip").is_file():
+            raise FileNotFoundError(f"There is no training state in {store.folder}: `load` reads a model that `save` wrote")
         try:
             model = cls._load_state(store, maybe_make_env(env, 0), device, **kwargs)
         except BaseException:

@@ -1,0 +1,145 @@
+"""Learning curves: by environment steps, beside published returns, and by minutes of processor time."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from benchmark.common.records import Record
+from benchmark.common.style import styles
+from benchmark.reporting.canvas import BAND, SEED, draw_line, label_steps, legend, panels, png, styled
+from benchmark.reporting.comparisons import RANDOM
+from benchmark.reporting.estimates import REPETITIONS, bootstrap, interquartile_mean
+from benchmark.reporting.literature import Published, published
+from benchmark.reporting.scores import Study, curves, evaluation_grid, failed, floors
+
+# The most curves in one panel; a study of more methods has a panel for each, beside the same reference
+MOST = 4
+REFERENCE = "TD3"
+BESIDE: dict[str, Any] = dict(color="#8A8A8A", linestyle="--", linewidth=1.6)
+ALONE = (6.6, 4.0)
+
+
+@styled
+def curves_by_steps(study: Study, task: str, repetitions: int = REPETITIONS) -> bytes:
+    """
+    Draw a task's learning curves: every seed, their interquartile mean, and its 95 % interval. Published mean returns within
+    the range of steps are hollow markers.
+
+    :param study: the study
+    :param task: the task
+    :param repetitions: number of bootstrap samples
+    :return: the picture, as PNG
+    """
+    records = [record for record in study.records if record.task == task]
+    figure, drawn = _figure(study, task, records, dict.fromkeys(study.methods, 1.0), repetitions)
+    for panel in drawn.values():
+        label_steps(panel)
+    for entry in published(task, study.facts["steps"]):
+        place = entry.method if entry.method in drawn else ""
+        if place in drawn:
+            _mark(drawn[place], entry)
+    legend(figure, list(drawn.values()), task)
+    return png(figure)
+
+
+@styled
+def curves_by_minutes(study: Study, task: str, repetitions: int = REPETITIONS) -> bytes:
+    """
+    Draw a task's learning curves by processor time: the same, without runs that have no time.
+
+    :param study: the study
+    :param task: the task, of which :func:`timed_runs` finds runs
+    :param repetitions: number of bootstrap samples
+    :return: the picture, as PNG
+    """
+    records, minutes_per_step = timed_runs(study, task)
+    figure, drawn = _figure(study, task, records, minutes_per_step, repetitions)
+    for panel in drawn.values():
+        panel.set_xlabel("minutes of processor time")
+    legend(figure, list(drawn.values()), task)
+    return png(figure)
+
+
+def timed_runs(study: Study, task: str) -> tuple[list[Record], dict[str, float]]:
+    """
+    Return a task's runs that curves by minutes show, and how long each method trains.
+
+    The time of a run is shared evenly among its steps, so that an evaluation takes place at ``processor_seconds`` times
+    its step, divided by the run's steps. An evaluation of a method stands at the mean of its runs' times. A failed run has
+    the time of the method's other runs, as the step at which it failed is not recorded.
+
+    :param study: the study
+    :param task: the task
+    :return: the runs, and the minutes per step by method; without methods of which no complete run has a time
+    """
+    measured = [record for record in study.records if record.task == task and record.processor_seconds is not None]
+    minutes: dict[str, list[float]] = {}
+    for record in measured:
+        if record.processor_seconds is not None and not failed(record):
+            minutes.setdefault(record.method, []).append(record.processor_seconds / 60 / record.steps)
+    paces = {method: float(np.mean(each)) for method, each in minutes.items()}
+    return [record for record in measured if record.method in paces], paces
+
+
+def shown_methods(study: Study, task: str) -> list[str]:
+    """
+    List the methods that a task's learning curves show.
+
+    :param study: the study
+    :param task: the task
+    :return: those that have runs, without random actions, whose level would squash the others' curves
+    """
+    ran = {record.method for record in study.records if record.task == task}
+    learners = [method for method in study.methods if method in ran and method != RANDOM]
+    return learners or [method for method in study.methods if method in ran]
+
+
+def _figure(
+    study: Study, task: str, records: Sequence[Record], units_per_step: Mapping[str, float], repetitions: int
+) -> tuple[Figure, dict[str, Axes]]:
+    """Draw each method's runs against its steps in some unit. The panels are by method, or the only one is that of all, ""."""
+    by_method = {method: [record for record in records if record.method == method] for method in shown_methods(study, task)}
+    by_method = {method: runs for method, runs in by_method.items() if runs}
+    floor, grid = floors(study.records)[task], evaluation_grid(records, task)
+    lines = {method: curves(runs, floor, grid) for method, runs in by_method.items()}
+    looks = styles(study.methods)
+    is_alone = len(by_method) <= MOST
+    figure, axes = panels(1, size=ALONE) if is_alone else panels(len(by_method), columns=3)
+    drawn = {"": axes[0]} if is_alone else dict(zip(by_method, axes, strict=True))
+    reference = REFERENCE if REFERENCE in by_method else next(iter(by_method))
+    for method, runs in by_method.items():
+        panel, x = drawn["" if is_alone else method], grid * units_per_step[method]
+        if len(grid) == 0:
+            continue
+        if not is_alone:
+            panel.set_title(_label(study, method, runs))
+            if method != reference:
+                beside = interquartile_mean(lines[reference][None])[0]
+                panel.plot(grid * units_per_step[reference], beside, label=f"{reference}, in all panels", **BESIDE)
+        panel.plot(x, lines[method].T, color=looks[method]["color"], label="_seed", **SEED)
+        middle, interval = bootstrap(interquartile_mean, [[lines[method]]], repetitions)
+        label, look = (
+            (_label(study, method, runs), looks[method]) if is_alone else ("_method", looks[method] | {"linestyle": "-"})
+        )
+        draw_line(panel, x, middle, label, look)
+        if interval is not None:
+            panel.fill_between(x, *interval, color=looks[method]["color"], **BAND)
+    for panel in axes[:: 1 if is_alone else 3]:
+        panel.set_ylabel("return")
+    return figure, drawn
+
+
+def _mark(panel: Axes, entry: Published) -> None:
+    (look,) = styles([entry.method]).values()
+    steps, means = list(entry.returns), [mean for mean, _ in entry.returns.values()]
+    marks = dict(look, linestyle="none", markerfacecolor="none", markersize=9, markeredgewidth=1.8, clip_on=False)
+    panel.plot(steps, means, label=f"{entry.method}, literature, {entry.version}", **marks)
+
+
+def _label(study: Study, method: str, runs: Sequence[Record]) -> str:
+    """Return a method's name, with the number of its runs where some of its seeds are missing."""
+    planned = len(study.facts["seeds"])
+    return method if len(runs) >= planned else f"{method} ({len(runs)} of {planned} seeds)"

@@ -1,0 +1,119 @@
+"""Whether the light setting of CEM loses anything against the paper's: the answer of all studies that ran both."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from benchmark.common.tables import markdown_table
+from benchmark.reporting.comparisons import (
+    HIGHER,
+    LOWER,
+    NOT_DISTINGUISHABLE,
+    TOO_FEW,
+    difference_in_words,
+    task_difference,
+)
+from benchmark.reporting.estimates import FEWEST_RUNS, Estimate, number_format
+from benchmark.reporting.scores import Study, score_table
+from benchmark.reporting.verdicts import LIGHT, OURS
+
+PAIR = (LIGHT, OURS)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """
+    The light setting against the paper's on a task.
+
+    :param place: the task, its steps and the study
+    :param reward: the difference of mean final rewards
+    :param share: the same as a share of the task's range
+    :param form: the format of rewards
+    """
+
+    place: str
+    reward: Estimate
+    share: Estimate
+    form: str
+
+    @property
+    def word(self) -> str:
+        """What the interval says."""
+        return difference_in_words(self.reward)
+
+    @property
+    def largest_loss(self) -> float | None:
+        """The largest loss within the interval, as a share of the task's range; None without an interval."""
+        return None if self.share.interval is None else max(0.0, -self.share.interval[0])
+
+
+def light_section(studies: Sequence[Study]) -> str:
+    """
+    Answer whether the light setting loses anything, and where.
+
+    :param studies: the studies
+    :return: the section, in Markdown; empty if no study without axes plans both methods
+    """
+    chosen = [study for study in studies if not study.axes and set(PAIR) <= set(study.methods)]
+    if not chosen:
+        return ""
+    compared, missing = [], []
+    for study in chosen:
+        table = score_table([study])
+        for task in dict.fromkeys([*study.facts["tasks"], *study.tasks]):
+            place = f"{task} ({study.name}, {study.facts['steps']:,} steps)"
+            reward, share = (task_difference(table, task, PAIR, column) for column in ("score", "share"))
+            if reward is None or share is None:
+                missing.append(place)
+            else:
+                form = number_format(table[table["task"] == task]["score"])
+                compared.append(Comparison(place, reward, share, form))
+    rows = [
+        [each.place, each.reward.in_words(each.form), each.word, _percent(each.largest_loss), str(each.reward.runs)]
+        for each in compared
+    ]
+    loss = "largest loss in the interval, of the task's range"
+    header = ["task", f"{LIGHT} − {OURS} (95 % interval)", f"{LIGHT} is", loss, "seeds"]
+    tables = [markdown_table(header, rows)] if rows else []
+    return "\n\n".join([f"## Does {LIGHT} lose anything against {OURS}?", answer(compared, missing), *tables])
+
+
+def answer(compared: Sequence[Comparison], missing: Sequence[str]) -> str:
+    """
+    Answer in sentences.
+
+    :param compared: the comparisons
+    :param missing: the tasks on which one of the two methods has no run yet
+    :return: the answer, in Markdown
+    """
+
+    def places(word: str) -> str:
+        return ", ".join(each.place for each in compared if each.word == word)
+
+    total = len(compared) + len(missing)
+    decided = [each for each in compared if each.word != TOO_FEW]
+    losses = [f"{each.place} by {each.reward.negative().in_words(each.form)}" for each in decided if each.word == LOWER]
+    if losses:
+        sentences = [f"**Yes, on {', '.join(losses)}.**"]
+    elif decided:
+        counted = f"{len(decided)} of {total} tasks, those with {FEWEST_RUNS} or more seeds of both"
+        sentences = [f"**No loss is shown on {counted}.**"]
+    else:
+        sentences = [f"**Not known yet: on no task have {FEWEST_RUNS} seeds of both methods ended.**"]
+    if places(HIGHER):
+        sentences.append(f"{LIGHT} is higher on {places(HIGHER)}.")
+    if places(NOT_DISTINGUISHABLE):
+        open_ = [each for each in decided if each.word == NOT_DISTINGUISHABLE]
+        worst = max(open_, key=lambda each: each.largest_loss or 0.0)
+        sentences.append(
+            f"The two are not distinguishable on {places(NOT_DISTINGUISHABLE)}, which is no proof that they are equal: the "
+            f"intervals contain losses of up to {_percent(worst.largest_loss)} of a task's range, on {worst.place}."
+        )
+    if places(TOO_FEW):
+        sentences.append(f"Too few seeds have ended on {places(TOO_FEW)}.")
+    if missing:
+        sentences.append(f"No runs of both have ended on {', '.join(missing)}.")
+    return " ".join(sentences)
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{share:.0%}"

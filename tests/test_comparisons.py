@@ -1,0 +1,205 @@
+"""Differences between methods against formulas by hand, and the answer on what the light setting loses."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from finished_studies import record, runs, write_study
+from scipy.special import stdtrit
+from tables import unpadded
+
+from benchmark.common.records import Record
+from benchmark.reporting.comparisons import (
+    HIGHER,
+    LOWER,
+    NOT_DISTINGUISHABLE,
+    TOO_FEW,
+    difference_in_words,
+    differences_table,
+    experiments_section,
+    pairs_of,
+)
+from benchmark.reporting.estimates import Estimate, welch
+from benchmark.reporting.light import light_section
+from benchmark.reporting.scores import Study, longest, read_study, score_table
+
+
+def study(folder: Path, records: list[Record], name: str = "sweep") -> Study:
+    return read_study(write_study(folder / name, records))
+
+
+def rows(table: str) -> dict[tuple[str, str], list[str]]:
+    """Return the other cells of a table's rows, by the first two."""
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in unpadded(table).splitlines()]
+    return {(first, second): rest for first, second, *rest in cells[2:]}
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(4, 4), (3, 5), (2, 10)])
+def test_interval_of_a_difference_is_welchs(ours: int, theirs: int) -> None:
+    draw = np.random.default_rng(0)
+    one, other = draw.normal(5, 1, ours), draw.normal(2, 4, theirs)
+    found = welch(one, other)
+    squares = [float(np.sum((each - each.mean()) ** 2)) / (len(each) - 1) / len(each) for each in (one, other)]
+    freedom = sum(squares) ** 2 / sum(square**2 / (len(each) - 1) for square, each in zip(squares, (one, other), strict=True))
+    half = stdtrit(freedom, 0.975) * math.sqrt(sum(squares))
+    assert found.value == pytest.approx(one.mean() - other.mean())
+    assert found.interval == pytest.approx((found.value - half, found.value + half))
+    assert found.runs == min(ours, theirs)
+
+
+def test_intervals_of_four_runs_hold_the_truth_about_as_often_as_the_page_says() -> None:
+    draw = np.random.default_rng(1)
+    held = []
+    for _ in range(400):
+        found = welch(draw.normal(1, 1, 4), draw.normal(0, 1, 4))
+        assert found.interval is not None
+        held.append(found.interval[0] <= 1 <= found.interval[1])
+    assert 0.93 <= np.mean(held) <= 0.98
+
+
+def test_difference_without_variance_or_of_single_runs() -> None:
+    assert welch(np.full(4, 3.0), np.full(4, 1.0)).interval == (2.0, 2.0)
+    assert welch(np.array([3.0]), np.array([1.0, 2.0])) == Estimate(1.5, None, 1)
+    # One side alone without variance has the interval of the other
+    found = welch(np.full(4, 3.0), np.array([0.0, 1.0, 2.0, 3.0]))
+    assert found.interval == pytest.approx((1.5 - 3.1824 * 0.6455, 1.5 + 3.1824 * 0.6455), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("interval", "number", "word"),
+    [
+        ((0.1, 2.0), 4, HIGHER),
+        ((-2.0, -0.1), 4, LOWER),
+        ((-0.1, 2.0), 4, NOT_DISTINGUISHABLE),
+        ((0.1, 2.0), 3, TOO_FEW),
+        (None, 1, TOO_FEW),
+    ],
+)
+def test_words(interval: tuple[float, float] | None, number: int, word: str) -> None:
+    assert difference_in_words(Estimate(1.0, interval, number)) == word
+
+
+def test_pairs() -> None:
+    assert pairs_of(["CGP-Online", "TD3", "CGP-Light", "Random"]) == [
+        ("CGP-Light", "CGP-Online"),
+        ("CGP-Light", "TD3"),
+        ("CGP-Online", "TD3"),
+    ]
+    assert pairs_of(["CGP-Online", "TD3"]) == [("CGP-Online", "TD3")]
+    assert pairs_of(["CGP-Light", "TD3"]) == [("CGP-Light", "TD3")]
+    assert pairs_of(["TD3", "SAC"]) == []
+
+
+def test_differences_on_each_task_and_on_all_that_have_enough_runs(tmp_path: Path) -> None:
+    level = {"CGP-Light": 100.0, "CGP-Online": 50.0, "TD3": 52.0}
+    records = runs(lambda method, _, seed: level[method] + 4 * seed, level, tasks=("Hopper-v5", "Ant-v5", "Pusher-v5"))
+    # On Ant, a tenth of the rewards; on Pusher, two seeds
+    records = [
+        replace(run, final=run.final / 10, returns=[0.0]) if run.task == "Ant-v5" and run.final is not None else run
+        for run in records
+        if run.task != "Pusher-v5" or run.seed < 2
+    ]
+    records.append(record("Random", 0, 12.0, "Hopper-v5", returns=[12.0]))
+    chosen = study(tmp_path, records)
+    found = rows(differences_table(score_table([chosen]), chosen.methods, repetitions=400))
+    # Standard error: sqrt(2 * (80 / 3) / 4); 6 degrees of freedom
+    half = 2.4469 * math.sqrt(2 * 80 / 3 / 4)
+    assert found["Hopper-v5", "CGP-Light − CGP-Online"] == [
+        f"50.0 ({50 - half:.1f} to {50 + half:.1f})",
+        HIGHER,
+        "4 and 4",
+    ]
+    assert found["Ant-v5", "CGP-Online − TD3"][1] == NOT_DISTINGUISHABLE
+    assert found["Pusher-v5", "CGP-Light − TD3"][1:] == [TOO_FEW, "2 and 2"]
+    # The best reward is 112, or 11.2; the lowest return 12, or 0
+    share, word, number = found["all tasks (2)", "CGP-Light − CGP-Online"]
+    assert float(share.split()[0]) == pytest.approx((50 / 100 + 5 / 11.2) / 2, abs=1e-3)
+    assert (word, number) == (HIGHER, "8 and 8")
+    assert found["all tasks (2)", "CGP-Online − TD3"][1] == NOT_DISTINGUISHABLE
+    assert not any("Random" in pair for _, pair in found)
+
+
+def test_tasks_in_studies_of_their_own_are_compared_together(tmp_path: Path) -> None:
+    """The rows are those of one study with all tasks, and an experiment of one study has none."""
+    draw = np.random.default_rng(0)
+
+    def of(task: str, experiment: str) -> list[Record]:
+        return [
+            replace(record(method, seed, float(draw.normal(mean, 1)), task=task), experiment=experiment)
+            for method, mean in (("CGP-Online", 5.0), ("TD3", 2.0))
+            for seed in range(4)
+        ]
+
+    pendulum, reacher = of("Pendulum-v1", "e1"), of("Reacher-v5", "e1")
+    alone = study(tmp_path, of("Hopper-v5", "e10-quick"), "alone")
+    first, second = study(tmp_path, pendulum, "first"), study(tmp_path, reacher, "second")
+    for each in (first, second, alone):
+        each.facts["experiment"] = each.records[0].experiment
+    together = study(tmp_path, pendulum + reacher, "together")
+    section = experiments_section([first, second, alone], 500)
+    assert "E1, the studies first, second:" in section
+    assert "E10" not in section
+    table = section[section.index("|") :]
+    ((pair, found),) = rows(table).items()
+    expected = rows(differences_table(score_table([together]), together.methods, 500))[pair]
+    assert pair == ("all tasks (2)", "CGP-Online − TD3")
+    assert found[0].split()[0] == expected[0].split()[0]
+    assert found[1:] == expected[1:] == [HIGHER, "8 and 8"]
+    assert experiments_section([first], 500) == experiments_section([alone], 500) == ""
+
+
+def test_one_task_is_not_all_tasks(tmp_path: Path) -> None:
+    chosen = study(tmp_path, runs(lambda method, _, seed: float(seed), ["CGP-Light", "TD3"]))
+    assert list(rows(differences_table(score_table([chosen]), chosen.methods))) == [("Pendulum-v1", "CGP-Light − TD3")]
+    assert differences_table(score_table([chosen]), ["TD3", "SAC"]) == ""
+
+
+def compared(folder: Path, light: dict[str, float], seeds: int = 4) -> str:
+    """Write a study in which the paper's setting scores 50 on each task, in a range from 0 to 100, and the light one so."""
+    tasks = list(light)
+    records = runs(lambda *run: 50.0 + run[2], ["CGP-Online"], seeds=range(seeds), tasks=tasks)
+    records += [record("CGP-Light", seed, light[task] + seed, task) for task in tasks for seed in range(seeds)]
+    records += [record("TD3", 0, 100.0, task, returns=[0.0]) for task in tasks]
+    return unpadded(light_section([study(folder, records)]))
+
+
+def test_losses_are_named_with_their_tasks(tmp_path: Path) -> None:
+    text = compared(tmp_path, {"Hopper-v5": 20.0, "Ant-v5": 80.0, "Pusher-v5": 50.0})
+    half = 2.4469 * math.sqrt(2 * 5 / 3 / 4)
+    assert f"**Yes, on Hopper-v5 (sweep, 1,000 steps) by 30.00 ({30 - half:.2f} to {30 + half:.2f}).**" in text
+    assert "CGP-Light is higher on Ant-v5 (sweep, 1,000 steps)." in text
+    assert "not distinguishable on Pusher-v5 (sweep, 1,000 steps), which is no proof" in text
+    assert f"losses of up to {half:.0f}% of a task's range, on Pusher-v5" in text
+    assert f"| Hopper-v5 (sweep, 1,000 steps) | -30.00 ({-30 - half:.2f} to {-30 + half:.2f}) | lower |" in text
+    assert "| higher | 0% | 4 |" in text
+
+
+def test_no_loss_and_nothing_known(tmp_path: Path) -> None:
+    assert "**No loss is shown on 1 of 1 tasks" in compared(tmp_path / "equal", {"Hopper-v5": 50.0})
+    text = compared(tmp_path / "few", {"Hopper-v5": 10.0}, seeds=3)
+    assert "**Not known yet: on no task have 4 seeds of both methods ended.**" in text
+    assert "Too few seeds have ended on Hopper-v5" in text
+
+
+def test_tasks_that_one_of_them_lacks_and_studies_that_do_not_compare_them(tmp_path: Path) -> None:
+    both = runs(lambda *_: 1.0, ["CGP-Light", "CGP-Online"], tasks=["Hopper-v5"])
+    unfinished = study(tmp_path, [*both, *runs(lambda *_: 1.0, ["CGP-Light"], tasks=["Ant-v5"])], "unfinished")
+    text = light_section([unfinished])
+    assert "**No loss is shown on 1 of 2 tasks" in text
+    assert "No runs of both have ended on Ant-v5 (unfinished, 1,000 steps)." in text
+    swept = runs(lambda *_: 1.0, ["CGP-Light", "CGP-Online"], [{"width": 32}, {"width": 64}])
+    assert light_section([study(tmp_path, swept, "swept")]) == ""
+    assert light_section([study(tmp_path, runs(lambda *_: 1.0, ["CGP-Light", "TD3"]), "without")]) == ""
+
+
+def test_longer_runs_replace_shorter_ones_only_if_they_have_all_their_methods(tmp_path: Path) -> None:
+    def of(methods: list[str], steps: int) -> Study:
+        records = [record(method, 0, 1.0, steps=steps) for method in methods]
+        return study(tmp_path, records, f"{steps}")
+
+    trial, whole, long = of(["TD3", "SAC"], 250), of(["CGP-Light", "SAC", "TD3"], 500), of(["CGP-Light", "TD3"], 1_000)
+    assert [kept.name for kept in longest([trial, whole, long])] == ["500", "1000"]
+    assert isinstance(score_table(longest([trial, whole, long])), pd.DataFrame)
