@@ -29,7 +29,7 @@ values of CEM's actions, not of the actor's.
 The episodes begin in the same states at each measurement, and a time limit truncates them after {{episode_steps:,}}
 steps. After a termination no reward follows, so that all states count. Of a truncated episode, those states count that
 at least {{horizon}} steps follow, as γ^{{horizon}} < {TAIL}. If later rewards are not larger than the largest in the
-episode, the rewards that are cut off change no bias by more than {{error_bound:.2g}}.
+episode, the rewards that are cut off change no bias by more than {{error_bound:.2g}} (0 if no episode was truncated).
 
 All methods: γ = {{gamma}}, τ = {{tau}}, batch size {{batch_size}}, two hidden layers of {{units}} units, learning rate
 {LEARNING_RATE}, {{learning_starts:,}} random steps. CGP-n: the paper's CEM, with n iterations of 64 samples. CGP-Light:
@@ -142,16 +142,19 @@ def looks(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
     Return the style of each method.
 
     :param methods: the methods
-    :return: Matplotlib's colour, line style and marker, by method: shades for CGP by its iterations
+    :return: Matplotlib's colour, line style and marker, by method: shades for CGP by its iterations, and own colours for
+        its variants
     """
     chosen = styles(methods)
     numbered = [method for method in MAIN if method.removeprefix("CGP-").isdecimal()]
-    shades = colormaps["viridis"](np.linspace(0.85, 0.1, len(numbered)))
-    shaded = dict(zip(numbered, shades, strict=True))
-    return {
-        method: look | dict(color=shaded[method], linestyle="-", marker="o") if method in shaded else look
-        for method, look in chosen.items()
-    }
+    shades = dict(zip(numbered, colormaps["viridis"](np.linspace(0.85, 0.1, len(numbered))), strict=True))
+    colors = dict(zip(VARIANTS, colormaps["Dark2"](range(1, len(VARIANTS) + 1)), strict=True))
+    for method, look in chosen.items():
+        if method in shades:
+            chosen[method] = look | dict(color=shades[method], linestyle="-", marker="o")
+        elif method in colors:
+            chosen[method] = look | dict(color=colors[method])
+    return chosen
 
 
 def draw(records: list[dict[str, Any]]) -> bytes:
