@@ -1,0 +1,1 @@
+"""How far a critic's values lie above the returns that follow."""
