@@ -6,12 +6,13 @@ import runpy
 import pytest
 from examples import ROOT, python_examples, run_in_order
 
+import sb3_cgp.population
 import sb3_cgp.resumption
 import sb3_cgp.selectors
 import sb3_cgp.zoo
 
 # Those whose examples have tests of their own, or belong to the clone
-ELSEWHERE = {"docs/architecture.md", "docs/experiments.md", "docs/trust.md"}
+ELSEWHERE = {"docs/architecture.md", "docs/experiments.md", "docs/population.md", "docs/trust.md"}
 PAGES = sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))
 WITH_EXAMPLES = [page for page in PAGES if page not in ELSEWHERE and python_examples(page)]
 RESULTS = (ROOT / "benchmark/results/sweeps/results.md").read_text()
@@ -43,7 +44,7 @@ def test_figures_on_hyperparameters_are_those_of_the_sweeps():
 def test_every_public_name_is_documented_once():
     reference = "".join((ROOT / "docs" / page).read_text() for page in ("algorithm.md", "api.md"))
     documented = [name.rpartition(".")[2] for name in re.findall(r"\.\. auto(?:class|function|exception):: (\S+)", reference)]
-    modules = (sb3_cgp, sb3_cgp.resumption, sb3_cgp.selectors, sb3_cgp.zoo)
+    modules = (sb3_cgp, sb3_cgp.population, sb3_cgp.resumption, sb3_cgp.selectors, sb3_cgp.zoo)
     public = {name for module in modules for name in module.__all__} - {"__version__"}
     assert sorted(documented) == sorted(public)
 
