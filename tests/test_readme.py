@@ -1,26 +1,22 @@
-"""The README's Python examples run as they stand, shortened."""
+"""The README is short, its example runs as it stands, shortened, and its files exist."""
 
 import re
-from pathlib import Path
 
-import pytest
+from examples import ROOT, python_examples, run_in_order
 
-from sb3_cgp import CGP
-
-README = (Path(__file__).parent.parent / "README.md").read_text()
-EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-# Past the warm-up of 500 random steps that the short examples have
-LONGEST = 510
+README = (ROOT / "README.md").read_text()
 
 
-def test_there_are_examples():
-    assert len(EXAMPLES) >= 4
+def test_readme_is_read_in_a_minute():
+    assert len(README.splitlines()) <= 150
+    assert len(python_examples("README.md")) >= 1
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=range(len(EXAMPLES)))
-def test_readme_example_runs(example, monkeypatch, tmp_path):
-    learn = CGP.learn
-    monkeypatch.setattr(CGP, "learn", lambda self, steps, **kwargs: learn(self, min(steps, LONGEST), **kwargs))
-    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 2)
-    monkeypatch.chdir(tmp_path)
-    exec(compile(example, "README.md", "exec"), {"__name__": "__main__"})
+def test_readme_example_runs(monkeypatch, tmp_path):
+    run_in_order("README.md", monkeypatch, tmp_path)
+
+
+def test_every_file_that_the_readme_links_to_exists():
+    linked = [link.partition("#")[0] for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
+    assert len(linked) > 20
+    assert [link for link in linked if not (ROOT / link).exists()] == []
