@@ -46,7 +46,13 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     :param argv: the arguments
     :return: the parsed arguments
     """
-    parser = measuring_parser("bias", "Measure how far the critic's values lie above the returns.", with_seed=False)
+    parser = measuring_parser(
+        "bias",
+        "Measure how far the critic's values lie above the returns.",
+        with_seed=False,
+        example="--methods CGP-2 TD3 --seeds 0",
+        duration="about 40 minutes",
+    )
 
     def add(option: str, default: int, text: str) -> None:
         parser.add_argument(option, type=count, default=default, help=f"{text} (default: %(default)s)")

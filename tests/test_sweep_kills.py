@@ -135,7 +135,9 @@ class Study:
         runs = load_sweep(str(self.sweep)).runs()
         assert Counter(key for key, state in trials if state == "COMPLETE") == Counter(run.key for run in runs)
         assert {state for _, state in trials} <= {"COMPLETE", "FAIL"}
-        return [asdict(record) | {"seconds": None} for record in read_records(self.folder / self.name)]
+        return [
+            asdict(record) | {"seconds": None, "processor_seconds": None} for record in read_records(self.folder / self.name)
+        ]
 
     def _export(self):
         export_study(self.name, self.url, self.folder)
