@@ -26,6 +26,7 @@ class Page(HTMLParser):
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note the anchor of an element, and the address that it links to or loads."""
         attributes = dict(attrs)
         self.anchors |= {value for name in ("id", "name") if (value := attributes.get(name))}
         if tag == "a" and (address := attributes.get("href")):

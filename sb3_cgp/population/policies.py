@@ -19,6 +19,7 @@ from sb3_cgp.algorithm import CGP
 from sb3_cgp.common.rules import require
 from sb3_cgp.population.adam import AgentAdam
 from sb3_cgp.population.networks import StackedMLP, agent_slices
+from sb3_cgp.selectors.proposals import takes_proposals
 
 
 class PopulationPolicy(BasePolicy):
@@ -91,7 +92,7 @@ class PopulationPolicy(BasePolicy):
         """
         critics, actors = (self.target_critics, self.averaged_actors) if by_targets else (self.critics, self.actors)
         arguments = {}
-        if self.actor_proposes and getattr(self.selector, "takes_proposals", False):
+        if self.actor_proposes and takes_proposals(self.selector):
             arguments["proposals"] = actors(features)[0].flatten(0, 1).unsqueeze(1)
         assert isinstance(self.action_space, spaces.Box) and self.selector is not None  # noqa: PT018
         n_rows, action_dim = features.shape[0] * features.shape[1], int(self.action_space.shape[0])

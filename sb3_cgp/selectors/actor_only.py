@@ -4,7 +4,7 @@ import torch as th
 
 from sb3_cgp.common.rules import require
 from sb3_cgp.core.cem import Score, Selection
-from sb3_cgp.selectors.proposals import SATURATION
+from sb3_cgp.selectors.proposals import before_tanh
 
 
 class ActorOnly:
@@ -38,4 +38,4 @@ class ActorOnly:
         allowed = "the actions of a trained actor, for which CGP needs policy_training='online' and a `policy_loss`"
         require(proposals is not None, "proposals", proposals, allowed)
         assert proposals is not None
-        return Selection(actions=proposals[:, 0], elites=proposals[:, :1].clamp(-SATURATION, SATURATION).atanh())
+        return Selection(actions=proposals[:, 0], elites=before_tanh(proposals[:, :1]))

@@ -6,7 +6,7 @@ from sb3_cgp.core.cgp import CGP
 from sb3_cgp.selectors.actor_cem import ActorCEM
 from sb3_cgp.selectors.actor_only import ActorOnly
 from sb3_cgp.selectors.policies import CGPPolicy
-from sb3_cgp.selectors.proposals import check_start
+from sb3_cgp.selectors.proposals import check_start, takes_proposals
 
 STARTS = ("prior", "actor")
 
@@ -35,9 +35,13 @@ class SelectorAlgorithm(CGP):
             allowed = "'prior' with another selector than CEM, such as the one in `policy_kwargs`"
             require(self.policy_kwargs.get("selector") is None, "cem_start", self.cem_start, allowed)
         super()._setup_model()
-        takes_proposals = getattr(self.policy.selector, "takes_proposals", False)
         allowed = "a subclass of sb3_cgp.CGPPolicy, whose actor can propose actions to the selector"
-        require(isinstance(self.policy, CGPPolicy) or not takes_proposals, "policy", self.policy_class, allowed)
+        require(
+            isinstance(self.policy, CGPPolicy) or not takes_proposals(self.policy.selector),
+            "policy",
+            self.policy_class,
+            allowed,
+        )
         if isinstance(self.policy.selector, ActorOnly):
             reason = "with the selector ActorOnly(), whose actions are the actor's own"
             require(self.policy_loss == "qgp", "policy_loss", self.policy_loss, f"'qgp' {reason}")

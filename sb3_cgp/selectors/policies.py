@@ -8,6 +8,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_cgp.common.networks import evaluation_mode
 from sb3_cgp.common.rules import require
 from sb3_cgp.core import policies
+from sb3_cgp.selectors.proposals import takes_proposals
 
 
 class CGPPolicy(policies.CGPPolicy):
@@ -36,7 +37,7 @@ class CGPPolicy(policies.CGPPolicy):
         :param critic: the critic, or the target critic
         :return: ``proposals``, (B, 1, A), or nothing
         """
-        if not self.actor_proposes or not getattr(self.selector, "takes_proposals", False):
+        if not self.actor_proposes or not takes_proposals(self.selector):
             return {}
         actor = self.actor_target if critic is self.critic_target else self.actor
         with evaluation_mode(actor):

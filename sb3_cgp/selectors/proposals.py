@@ -5,7 +5,7 @@ Shapes: B states, P proposals and N samples per state, A action dimensions.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch as th
 
@@ -71,7 +71,7 @@ class ActorStart:
         proposals = proposals[:, : samples.shape[1]]
         n_proposals = proposals.shape[1]
         n_around = min(round(self.fraction * samples.shape[1]), samples.shape[1] - n_proposals)
-        centres = proposals.clamp(-SATURATION, SATURATION).atanh()
+        centres = before_tanh(proposals)
         samples[:, :n_proposals] = centres
         if n_proposals > 1:
             # Each of them in turn; one alone is broadcast
@@ -80,6 +80,26 @@ class ActorStart:
         actions = samples.tanh()
         actions[:, :n_proposals] = proposals
         return samples, actions
+
+
+def takes_proposals(selector: Any) -> bool:
+    """
+    Return whether a selector wants proposals.
+
+    :param selector: the selector; one without the attribute of :class:`ProposalSelector` wants none
+    :return: whether it does
+    """
+    return bool(getattr(selector, "takes_proposals", False))
+
+
+def before_tanh(actions: th.Tensor) -> th.Tensor:
+    """
+    Return the values before tanh of actions, which are clipped at a magnitude of ``SATURATION``.
+
+    :param actions: actions within [-1, 1]
+    :return: the values, of the same shape
+    """
+    return actions.clamp(-SATURATION, SATURATION).atanh()
 
 
 def take(values: th.Tensor, indices: th.Tensor) -> th.Tensor:
