@@ -1,6 +1,8 @@
-"""What every test shares: one thread, and the CPU, so that the same is tested with and without a GPU."""
+"""What tests share: one thread; the CPU, so that the same is tested with and without a GPU; fixtures of several modules."""
 
+import shutil
 import signal
+from pathlib import Path
 
 import pytest
 import torch as th
@@ -42,3 +44,46 @@ def heeds_interruptions():
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, handler)
+
+
+@pytest.fixture
+def short_policy_training(monkeypatch):
+    """Rounds of 10 steps, so that offline training takes a moment."""
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
+
+
+@pytest.fixture
+def no_onnx(monkeypatch):
+    """ONNX takes a second to make: leave it out where it is not at issue."""
+    monkeypatch.setattr("sb3_cgp.export.write._checked_onnx", lambda *args: b"another")
+
+
+@pytest.fixture(scope="module")
+def exports(tmp_path_factory):
+    """Two different exports, and their models; not to be written to."""
+    # Here, as ONNX takes a second to import
+    from exports import make_model
+
+    folders, models = [], []
+    for seed in (0, 1):
+        folders.append(tmp_path_factory.mktemp("export"))
+        models.append(make_model(seed=seed, normalize=dict() if seed == 0 else None))
+        models[-1].export(folders[-1])
+    return folders, models
+
+
+@pytest.fixture(scope="module")
+def dict_export(tmp_path_factory):
+    """An export of goals and images, of which the goals are normalised, and its model; not to be written to."""
+    from exports import make_goal_model
+
+    folder = tmp_path_factory.mktemp("dict_export")
+    model = make_goal_model()
+    model.export(folder)
+    return folder, model
+
+
+@pytest.fixture
+def folder(exports, tmp_path):
+    """A copy of an export, to be spoilt."""
+    return Path(shutil.copytree(exports[0][0], tmp_path / "export"))
