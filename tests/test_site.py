@@ -5,14 +5,17 @@ import runpy
 
 import pytest
 from examples import ROOT, python_examples, run_in_order
+from stable_baselines3.common.logger import KVWriter, Logger
 
 import sb3_cgp.population
 import sb3_cgp.resumption
 import sb3_cgp.selectors
 import sb3_cgp.zoo
+from sb3_cgp import CGP
+from sb3_cgp.population import Population
 
 # Those whose examples have tests of their own, or belong to the clone
-ELSEWHERE = {"docs/architecture.md", "docs/experiments.md", "docs/population.md", "docs/trust.md"}
+ELSEWHERE = {"docs/architecture.md", "docs/experiments.md", "docs/population.md"}
 PAGES = sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))
 WITH_EXAMPLES = [page for page in PAGES if page not in ELSEWHERE and python_examples(page)]
 RESULTS = (ROOT / "benchmark/results/sweeps/results.md").read_text()
@@ -39,6 +42,26 @@ def test_figures_on_hyperparameters_are_those_of_the_sweeps():
     recorded = {(row[1], row[3], row[5]) for row in recorded if len(row) == 9}
     assert len(rows) == 24
     assert [row for row in rows if tuple(row) not in recorded] == []
+
+
+class Keys(KVWriter):
+    """Collects the keys of a log."""
+
+    def __init__(self):
+        self.keys = set()
+
+    def write(self, key_values, key_excluded, step=0):
+        self.keys |= key_values.keys()
+
+
+def test_the_logged_keys_are_those_that_the_page_explains():
+    section = (ROOT / "docs/algorithm.md").read_text().partition("## What training logs\n")[2].partition("\n## ")[0]
+    keys, arguments = Keys(), dict(learning_starts=20, batch_size=8, policy_kwargs=dict(net_arch=[8]), seed=0)
+    for model in (CGP("MlpPolicy", "Pendulum-v1", **arguments), Population("MlpPolicy", "Pendulum-v1", 1, **arguments)):
+        model.set_logger(Logger(None, [keys]))
+        # An episode, after which the log is written
+        model.learn(200, log_interval=1)
+    assert {key for key in keys.keys if key.startswith("train/")} == set(re.findall(r"`(train/\w+)`", section))
 
 
 def test_every_public_name_is_documented_once():
