@@ -204,7 +204,7 @@ def test_page_of_e10(tmp_path: Path) -> None:
     records = runs(lambda method, *_: level[method] + draw_reward.normal(), E10, seeds=range(5), tasks=FORBIDDEN)
     folder = write_study(tmp_path / "e10", [replace(run, experiment="e10", processor_seconds=60.0) for run in records])
     text = unpadded(figures([folder], tmp_path, 100).read_text())
-    assert "## The study e10" in text
+    assert "## The study e10, " in text
     assert "Seeds 0, 1, 2, 3, 4;" in text
     for task in FORBIDDEN:
         for method in E10:
@@ -216,7 +216,8 @@ def test_page_of_e10(tmp_path: Path) -> None:
             assert finals[0] - 0.06 <= float(low) < float(value) < float(high) <= finals[4] + 0.06
     assert "| all tasks (2) | CGP-Online − TD3 |" in text
     # Its tasks are not those of the paper's claims
-    claims = text[text.index("## The paper's claims") : text.index("## Does CGP-Light lose")]
+    claims = text[text.index("## The paper's claims") : text.index("## How to read")]
+    assert "online training" in claims
     assert "ForbiddenPendulum" not in claims
     assert {path.name for path in (tmp_path / "figures" / "e10").iterdir()} == {
         "final_rewards.png",
