@@ -22,7 +22,7 @@ from benchmark import sweep
 from benchmark.common.measuring import measuring_parser
 from benchmark.common.style import FURTHER, METHODS, styles
 from benchmark.figures import main
-from benchmark.reporting import drawing
+from benchmark.reporting import drawing, summary
 from benchmark.reporting import figures as command
 from benchmark.reporting.drawing import differing_range, final_rewards, stability
 from benchmark.reporting.figures import figures, study_folders
@@ -402,3 +402,30 @@ def test_runs_at_numbers_that_are_none(tmp_path: Path) -> None:
     table = score_table([study])
     assert np.isfinite(table["score"]).all()
     assert "the final reward is no number" in figures([study.folder], tmp_path, repetitions=20).read_text()
+
+
+def test_summary_is_learning_curves_beside_stability(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    kept: list[Figure] = []
+    draw = summary.png
+    monkeypatch.setattr(summary, "png", lambda figure: kept.append(figure) or draw(figure))
+    options = ["--folder", str(folder), "--repetitions", "20", "--summary", str(tmp_path / "summary.png")]
+    before = (folder / "results.md").read_bytes()
+    main(["tasks", "axes", *options])
+    assert (tmp_path / "summary.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "results.md").read_bytes() == before
+    left, right = kept[0].axes
+    assert (left.get_title(), right.get_title()) == ("Pendulum-v1", "Pendulum-v1, 4 settings")
+    for panel in (left, right):
+        names = [str(line.get_label()) for line in panel.get_lines() if not str(line.get_label()).startswith("_")]
+        assert names == ["CGP-Online", "TD3", "SAC"]
+    for studies, fault in (
+        (["axes", "tasks"], "must be a study of learning curves"),
+        (["tasks", "tasks"], "one of hyperparameters"),
+    ):
+        with pytest.raises(SystemExit, match=fault):
+            main([*studies, *options])
+    with pytest.raises(SystemExit):
+        main(["tasks", *options])
+    assert "name two studies" in capsys.readouterr().err

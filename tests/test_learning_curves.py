@@ -115,6 +115,24 @@ def test_published_returns_are_hollow_markers_at_their_steps(tmp_path: Path, dra
     (marks,) = (line for line in panel.get_lines() if line.get_label() == "TD3, literature, v1")
     assert (marks.get_markerfacecolor(), marks.get_linestyle()) == ("none", "None")
     assert (marks.get_color(), marks.get_marker()) == (METHODS["TD3"]["color"], METHODS["TD3"]["marker"])
+    low, high = panel.get_ylim()
+    assert low < 10.0 < 8112.0 <= high
+
+
+def test_untrained_policies_do_not_squash_the_curves(tmp_path: Path, drawn: list[Figure]) -> None:
+    """Of evaluations at 250, 500, 750 and 1,000 steps, with 500 random ones, the last two make the vertical axis."""
+    records = [record("CEM", seed, -6.0, returns=[-90.0, -80.0, -10.0 - seed, -6.0]) for seed in range(4)]
+    chosen = study(
+        tmp_path, records, configurations={"CEM": {"algo": "cgp", "learning_starts": 500}, "Random": {"algo": "random"}}
+    )
+    curves_by_steps(chosen, "Pendulum-v1", 20)
+    low, high = drawn[0].axes[0].get_ylim()
+    assert -14 < low < -13
+    assert -6 < high < -5
+    # Where nothing was evaluated after them, all evaluations
+    chosen.facts["configurations"]["CEM"]["learning_starts"] = 1_000
+    curves_by_steps(chosen, "Pendulum-v1", 20)
+    assert drawn[1].axes[0].get_ylim()[0] < -90
 
 
 def test_few_methods_share_a_panel_and_many_have_their_own_beside_one_reference(tmp_path: Path, drawn: list[Figure]) -> None:

@@ -140,7 +140,8 @@ def _vertical(study: Study, task: str) -> dict[str, Any]:
         for step, value in zip(record.timesteps, record.returns, strict=True)
         if step > first and np.isfinite(value)
     ]
-    return {"range": list(learnt_range(np.array(returns)))} if returns else {}
+    anchors = [mean for entry in published(task, study.facts["steps"]) for mean, _ in entry.returns.values()]
+    return {"range": list(learnt_range(np.array(returns + anchors)))} if returns else {}
 
 
 def _rounded(values: np.ndarray) -> list[float]:

@@ -40,6 +40,8 @@ def curves_by_steps(study: Study, task: str, repetitions: int = REPETITIONS) -> 
         place = entry.method if entry.method in drawn else ""
         if place in drawn:
             _mark(drawn[place], entry)
+            means = [mean for mean, _ in entry.returns.values()]
+            drawn[place].set_ylim(learnt_range(np.array([*drawn[place].get_ylim(), *means]), margin=0.0))
     legend(figure, list(drawn.values()), task)
     return png(figure)
 
@@ -144,16 +146,17 @@ def first_training_step(study: Study) -> int:
     return max((int(entry.get("learning_starts", 0)) for entry in configurations), default=0)
 
 
-def learnt_range(returns: np.ndarray) -> tuple[float, float]:
+def learnt_range(returns: np.ndarray, margin: float = 0.04) -> tuple[float, float]:
     """
     Return the range of the vertical axis.
 
     :param returns: the returns of all evaluations after the first training step (N), at least one
-    :return: their range, with a margin
+    :param margin: the margin on each side, as a share of their range
+    :return: their range, with the margin
     """
     low, high = float(returns.min()), float(returns.max())
-    margin = 0.04 * (high - low) or 1.0
-    return low - margin, high + margin
+    beyond = margin * (high - low) if high > low else 1.0
+    return low - beyond, high + beyond
 
 
 def _mark(panel: Axes, entry: Published) -> None:
