@@ -11,7 +11,8 @@ from benchmark.reporting.interactive import figure
 from benchmark.reporting.scores import Study, read_study
 
 PAGE = "docs/curves"
-MARK = "[figures]: #"
+# What stands in their place where the page is read without the site
+MARK = "The figures are drawn when the site is built, by `make docs`."
 SWEEPS = Path("benchmark/results/sweeps")
 PLOTLY = Path(plotly.__file__).parent / "package_data" / "plotly.min.js"
 
@@ -42,6 +43,8 @@ def fill(app: Sphinx, docname: str, source: list[str]) -> None:
         f"[study.json](../{SWEEPS}/{study.name}/study.json)"
         for study in studies
     )
+    if MARK not in source[0]:
+        raise ValueError(f"{PAGE}.md has no place for the figures: {MARK!r}")
     source[0] = source[0].replace(MARK, "\n\n".join(figures)) + f"\n{records}\n"
 
 

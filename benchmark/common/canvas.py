@@ -95,7 +95,7 @@ def legend(figure: Figure, panel: Sequence[Axes], title: str | None = None) -> N
     """
     entries = {label: handle for axes in panel for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     # Inches, at the size of letters above
-    widest = 0.95 + 0.105 * max(map(len, entries), default=0)
+    widest = 0.8 + 0.1 * max(map(len, entries), default=0)
     columns = max(min(len(entries), int(figure.get_figwidth() / widest)), 1)
     look: dict[str, Any] = dict(loc="outside upper center", ncols=columns, frameon=False, handlelength=2.6, columnspacing=1.4)
     figure.legend(list(entries.values()), list(entries), title=title, **look)

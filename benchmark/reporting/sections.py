@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import pandas as pd
@@ -74,14 +73,10 @@ def heading(study: Study, task: str | None = None) -> str:
     if experiment_number(study) is not None:
         # The titles of this project's own files begin with an ordinary word
         title = title[0].lower() + title[1:]
-    methods = [method for method in study.methods if task is None or any(_is_of(run, task, method) for run in study.records)]
-    who = ", ".join(methods) if len(methods) <= 4 else f"{len(methods)} methods"
-    text = f"{title}, {who} ({study.name})" if methods else f"{title} ({study.name})"
+    # All planned methods, so that links to the section hold while runs end
+    who = ", ".join(study.methods) if len(study.methods) <= 4 else f"{len(study.methods)} methods"
+    text = f"{title}, {who} ({study.name})" if study.methods else f"{title} ({study.name})"
     return f"{task}: {text}" if task is not None else text[0].upper() + text[1:]
-
-
-def _is_of(run: Any, task: str, method: str) -> bool:
-    return (run.task, run.method) == (task, method)
 
 
 def study_sections(
