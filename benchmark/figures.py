@@ -13,6 +13,9 @@ from pathlib import Path
 from benchmark.common.arguments import add_epilog, count, output_folder
 from benchmark.reporting.estimates import REPETITIONS
 from benchmark.reporting.figures import FIGURES, FIGURES_ONLY, FOLDER, figures, study_folders
+from benchmark.reporting.scores import read_study
+from benchmark.reporting.summary import summary
+from sb3_cgp.common.files import write_atomically
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -33,13 +36,21 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--repetitions", type=count, default=REPETITIONS, help="number of bootstrap samples (default: %(default)s)"
     )
     parser.add_argument(FIGURES_ONLY, action="store_true", help="draw the figures, and leave the page as it is")
+    parser.add_argument(
+        "--summary",
+        type=Path,
+        metavar="FILE",
+        help="draw one figure into FILE, and nothing else: the learning curves of the first STUDY's first task, and the "
+        "stability of the second STUDY, a sweep over hyperparameters",
+    )
     add_epilog(
         parser,
         "examples:\n"
         "  python -m benchmark.figures\n"
         "  python -m benchmark.figures results/sweeps/e3-Pendulum-v1\n"
         "  python -m benchmark.figures --folder benchmark/results/sweeps\n"
-        "  python -m benchmark.figures e3-Pendulum-v1 --storage sqlite:///logs/sweeps/studies.db",
+        "  python -m benchmark.figures e3-Pendulum-v1 --storage sqlite:///logs/sweeps/studies.db\n"
+        "  python -m benchmark.figures e1-Pendulum-v1 e6-Pendulum-v1 --summary summary.png",
         "It takes seconds to minutes. results.md and figures/ are written to --folder; the third example is for this\n"
         "repository's own results.",
     )
@@ -50,6 +61,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         folders = [find(study, args.storage, args.folder) for study in named] or study_folders(args.folder)
         if not folders:
             raise FileNotFoundError(f"{args.folder} holds no study")
+        if args.summary is not None:
+            if len(named) != 2:
+                parser.error("argument --summary: name two studies, one of learning curves and one of hyperparameters")
+            learning, sweep = map(read_study, folders)
+            write_atomically(args.summary, summary(learning, sweep, args.repetitions))
+            print(args.summary)
+            return
         print(figures(folders, args.folder, args.repetitions, not args.figures_only))
     except (FileNotFoundError, ValueError) as error:
         sys.exit(f"Error: {error}")

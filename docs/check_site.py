@@ -1,10 +1,12 @@
 """
-Check a built site without a network: every internal link, anchor, image and script exists, and no page loads from elsewhere.
+Check a built site without a network: every internal link, anchor, image and script exists, no page loads from elsewhere, and
+every figure for plotly.js is data that a browser reads and has the one file of plotly.js on its page.
 
 `python docs/check_site.py FOLDER` prints what is wrong, and exits with status 1 if anything is.
 """
 
 import argparse
+import json
 import sys
 from collections.abc import Iterator
 from html.parser import HTMLParser
@@ -23,6 +25,9 @@ class Page(HTMLParser):
         self.anchors = {""}
         self.linked: list[str] = []
         self.loaded: list[str] = []
+        self.figures: list[str] = []
+        self.data: dict[str, str] = {}
+        self.reading: str | None = None
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -33,6 +38,36 @@ class Page(HTMLParser):
             self.linked.append(address)
         if tag in LOADED and (address := attributes.get(LOADED[tag])):
             self.loaded.append(address)
+        if figure := attributes.get("data-figure"):
+            self.figures.append(figure)
+        self.reading = attributes.get("id") if attributes.get("type") == "application/json" else None
+
+    def handle_data(self, data: str) -> None:
+        """Keep the data of a figure."""
+        if self.reading is not None:
+            self.data[self.reading] = self.data.get(self.reading, "") + data
+
+    def handle_endtag(self, tag: str) -> None:
+        """End the data of a figure."""
+        self.reading = None
+
+
+def find_figure_faults(page: Page) -> Iterator[str]:
+    """
+    Yield a line for every fault of a page's figures.
+
+    :param page: the page
+    """
+    for figure in page.figures:
+        try:
+            has_curves = bool(json.loads(page.data.get(figure, ""))["data"])
+        except (ValueError, KeyError):
+            has_curves = False
+        if not has_curves:
+            yield f"{figure}: no data"
+    scripts = [address for address in page.loaded if "plotly" in address]
+    if page.figures and len(scripts) != 1:
+        yield f"loads plotly.js {len(scripts)} times"
 
 
 def find_faults(folder: Path) -> Iterator[str]:
@@ -47,6 +82,7 @@ def find_faults(folder: Path) -> Iterator[str]:
     for path, page in pages.items():
         name = path.relative_to(folder.resolve())
         yield from (f"{name}: loads {address} from a network" for address in page.loaded if is_external(address))
+        yield from (f"{name}: {fault}" for fault in find_figure_faults(page))
         for address in page.linked + page.loaded:
             if not is_external(address) and (fault := find_fault(path, address, pages)):
                 yield f"{name}: {address}: {fault}"

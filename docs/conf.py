@@ -1,9 +1,11 @@
 """Sphinx's configuration. The source folder is the repository's root, so that links between all pages hold on GitHub, too."""
 
+import sys
 from importlib.metadata import version as installed_version
+from pathlib import Path
 
-from pygments.lexers.special import TextLexer
-from sphinx.application import Sphinx
+# This folder's own extensions, and benchmark/, which is not installed
+sys.path += [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
 
 project = "sb3-cgp"
 author = "The sb3-cgp authors"
@@ -14,7 +16,7 @@ root_doc = "docs/index"
 include_patterns = ["README.md", "CHANGELOG.md", "docs/**", "benchmark/results/**"]
 exclude_patterns = [".*", "build", "dist", "logs", "venv"]
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton", "site_curves", "site_diagrams"]
 myst_enable_extensions = ["deflist"]
 # Links to headings, as GitHub has them
 myst_heading_anchors = 3
@@ -33,8 +35,3 @@ html_additional_pages = {"index": "redirect.html"}
 templates_path = ["templates"]
 html_copy_source = False
 pygments_style, pygments_dark_style = "tango", "monokai"
-
-
-def setup(app: Sphinx) -> None:
-    """Show diagrams in Mermaid's language, which GitHub draws, as text."""
-    app.add_lexer("mermaid", TextLexer)

@@ -381,3 +381,25 @@ def test_page_averages_the_second_half_of_the_training():
 def test_horizon():
     assert episodes.horizon(0.99) == 459
     assert math.isclose(0.5 ** episodes.horizon(0.5), 1 / 128)
+
+
+def test_figure_has_at_most_four_methods_a_panel_and_every_seed(monkeypatch):
+    def run(method, seed):
+        values = {"q1": 3.0 + seed, "q_min": 2.0, "discounted_return": 1.0, "return": 5.0 * seed}
+        return {"method": method, "seed": seed, "points": [{"steps": steps, "actor": values} for steps in (10, 20)]}
+
+    kept = []
+    monkeypatch.setattr(bias_page, "png", lambda figure: kept.append(figure) or b"")
+    bias_page.draw([run(method, seed) for method in methods.METHODS for seed in (0, 1)])
+    panels = kept[0].axes
+    assert len(panels) == 2 * len(bias_page.ROWS)
+    assert {method for row in bias_page.ROWS for method in row} == set(methods.METHODS)
+    for row, left, right in zip(bias_page.ROWS, panels[::2], panels[1::2], strict=True):
+        assert len(row) <= 4
+        for panel, low, mean, high in ((left, 2.0, 2.5, 3.0), (right, 0.0, 2.5, 5.0)):
+            lines = [line for line in panel.get_lines() if len(line.get_xdata()) == 2 and line.get_xdata()[1] == 20]
+            assert [line.get_ydata()[0] for line in lines] == [low, high, mean] * len(row)
+        assert sorted(text.get_text() for text in right.texts) == sorted(row)
+        assert (left.get_ylim(), right.get_ylim()) == (panels[0].get_ylim(), panels[1].get_ylim())
+    bias_page.draw([run("TD3", 0)])
+    assert len(kept[1].axes) == 2

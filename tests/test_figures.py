@@ -1,5 +1,7 @@
 """``python -m benchmark.figures``: which figures studies get, what the page says, and that both repeat."""
 
+import json
+import re
 import shlex
 import shutil
 import subprocess
@@ -20,12 +22,13 @@ from benchmark import sweep
 from benchmark.common.measuring import measuring_parser
 from benchmark.common.style import FURTHER, METHODS, styles
 from benchmark.figures import main
-from benchmark.reporting import drawing
+from benchmark.reporting import drawing, summary
 from benchmark.reporting import figures as command
 from benchmark.reporting.drawing import differing_range, final_rewards, stability
 from benchmark.reporting.figures import figures, study_folders
-from benchmark.reporting.page import reward_tables
+from benchmark.reporting.overview import anchor
 from benchmark.reporting.scores import curves, evaluation_grid, read_study, score_table
+from benchmark.reporting.sections import reward_tables
 
 ROOT = Path(__file__).parents[1]
 GRID = [{"learning_rate": rate, "batch_size": size} for rate in (0.01, 0.001) for size in (64, 32)]
@@ -120,27 +123,73 @@ def test_pictures_have_the_methods_own_colours(folder: Path) -> None:
 
 
 def test_page_shows_every_figure_with_its_command(folder: Path, tmp_path: Path) -> None:
-    lines = (folder / "results.md").read_text().splitlines()
-    shown = [line.partition("](")[2].rstrip(")") for line in lines if line.startswith("![")]
+    text = (folder / "results.md").read_text()
+    shown = re.findall(r"^!\[.+\]\((.+)\)$", text, flags=re.MULTILINE)
     assert sorted(shown) == sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.png"))
-    for number, line in enumerate(lines):
-        if line.startswith("!["):
-            assert "`python -m benchmark.figures " in lines[number + 2]
+    assert text.count("\n\n*") >= len(shown)
 
-    # The command under a figure draws it, and leaves the page as it is
-    name = "figures/axis/stability.png"
-    caption = lines[next(number for number, line in enumerate(lines) if name in line) + 2]
-    program, _, module, *arguments = shlex.split(caption.split("`")[1])
+    # The command in a study's section draws its figures, and leaves the page as it is
+    section = next(part for part in text.split("\n## ") if "figures/axis/stability.png" in part)
+    program, _, module, *arguments = shlex.split(section.partition("The figures: `")[2].partition("`")[0])
     assert (program, module) == ("python", "benchmark.figures")
     arguments[arguments.index("--folder") + 1] = str(tmp_path)
     main(arguments)
-    assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()
+    for drawn in (folder / "figures/axis").iterdir():
+        assert (tmp_path / "figures/axis" / drawn.name).read_bytes() == drawn.read_bytes()
     assert not (tmp_path / "results.md").exists()
+
+
+def test_a_section_for_each_task_with_the_records_and_all_commands_in_folds(folder: Path) -> None:
+    text = (folder / "results.md").read_text()
+    headings = [line for line in text.splitlines() if line.startswith("## ")]
+    assert len(set(headings)) == len(headings)
+    assert {
+        "## The study tasks, CGP-Online, TD3, SAC, My-PPO (tasks)",
+        "## Pendulum-v1: The study tasks, CGP-Online, TD3, SAC, My-PPO (tasks)",
+        "## ALE/Pong-v5: The study tasks, CGP-Online, TD3, SAC, My-PPO (tasks)",
+        "## Pendulum-v1: The study variants, CGP-Online, CGP-Offline (variants)",
+    } < set(headings)
+    assert "[runs.jsonl](axis/runs.jsonl)" in text
+    unfolded = re.sub(r"<details>.*?</details>", "", text, flags=re.DOTALL)
+    for hidden in (f"python -m {SWEEP}", "commit ", "numpy "):
+        assert hidden in text
+        assert hidden not in unfolded
+    # A Git host and MyST read Markdown within an element after an empty line only
+    assert text.count("</summary>\n\n") == text.count("<details>") == text.count("\n\n</details>")
+
+
+def test_findings_link_to_their_sections(folder: Path) -> None:
+    text = (folder / "results.md").read_text()
+    anchors = {anchor(line[3:]) for line in text.splitlines() if line.startswith("## ")}
+    links = re.findall(r"\]\(#([^)]+)\)", text)
+    assert len(links) == 5
+    assert set(links) <= anchors
+    rows = unpadded(text.partition("## Findings by task")[2].partition("\n## ")[0])
+    assert "| 1,000 | 24 of 30 so far | Highest: CGP-Online" in rows
+    assert "CGP-Online: rank 1 of 4; higher than TD3, SAC, My-PPO." in rows
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_one_seed_of_a_few_methods_concludes_nothing(tmp_path: Path) -> None:
+    folder = write_study(tmp_path / "begun", runs(score, BASELINES, seeds=[0]), planned=24)
+    facts = json.loads((folder / "study.json").read_text())
+    facts |= {"seeds": [0, 1, 2, 3], "tasks": ["Pendulum-v1", "Reacher-v5"]}
+    (folder / "study.json").write_text(json.dumps(facts))
+    text = unpadded(figures([folder], tmp_path, 20).read_text())
+    assert "**Unfinished, so that results may change: begun (3 of 24 runs).**" in text
+    assert "3 of 12 so far" in text
+    assert "**Too few runs: nothing is concluded.**" in text
+    assert "| Reacher-v5, begun | 1,000 | 0 of 12 so far | no run has ended |" in text
+    assert "| 1 of 4 so far | 0 |" in text
+    assert "Methods are compared from 4 runs on, which none of them has yet." in text
+    assert "Differences between methods" not in text
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_page_repeats(folder: Path, tmp_path: Path) -> None:
-    again = figures(study_folders(folder), tmp_path, repetitions=100).read_text()
+    for study in study_folders(folder):
+        shutil.copytree(study, tmp_path / study.name)
+    again = figures(study_folders(tmp_path), tmp_path, repetitions=100).read_text()
     assert again.replace(str(tmp_path), str(folder)) == (folder / "results.md").read_text()
 
 
@@ -169,7 +218,9 @@ def test_single_seed_and_a_study_without_runs(tmp_path: Path) -> None:
     text = unpadded(figures([single, empty], tmp_path, repetitions=50).read_text())
     assert "-150 (no interval)" in text.replace("-150.0", "-150")
     assert "0 of 8 planned runs have ended" in text
-    assert "**supported**" not in text.replace("inference cost is independent of the CEM iterations | **supported**", "")
+    # The cost of inference does not depend on these runs
+    supported = [line for line in text.splitlines() if "**supported**" in line]
+    assert [line.startswith("| the actor's inference cost is independent") for line in supported] == [True]
 
 
 def test_a_method_whose_runs_all_failed_before_an_evaluation(tmp_path: Path) -> None:
@@ -265,8 +316,8 @@ def test_all_studies_of_a_folder(folder: Path, tmp_path: Path) -> None:
     options = ["--folder", str(tmp_path), "--repetitions", "20"]
     main(options)
     page = (tmp_path / "results.md").read_text()
-    assert "## The study axis" in page
-    assert "## The study axes" in page
+    assert "## Pendulum-v1: The study axis, " in page
+    assert "## Pendulum-v1: The study axes, " in page
     # As the shell has them in the place of a star, the folder of the figures among them
     folders = [f"{path}/" for path in sorted(tmp_path.iterdir()) if path.is_dir()]
     assert str(tmp_path / "figures/") in [path.rstrip("/") for path in folders]
@@ -296,8 +347,9 @@ def test_named_study_is_taken_from_its_storage(folder: Path, tmp_path: Path, mon
     [
         ("e3", "## The paper's claims"),
         ("e8", "## The paper's claims"),
-        ("mine", "## The study mine"),
-        ("e10", "## The study e10"),
+        ("mine", "## Findings by task"),
+        ("e10", "## Findings by task"),
+        ("e10-quick", "## Findings by task"),
     ],
 )
 def test_page_begins_with_the_findings(experiment: str, first: str, tmp_path: Path) -> None:
@@ -350,3 +402,30 @@ def test_runs_at_numbers_that_are_none(tmp_path: Path) -> None:
     table = score_table([study])
     assert np.isfinite(table["score"]).all()
     assert "the final reward is no number" in figures([study.folder], tmp_path, repetitions=20).read_text()
+
+
+def test_summary_is_learning_curves_beside_stability(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    kept: list[Figure] = []
+    draw = summary.png
+    monkeypatch.setattr(summary, "png", lambda figure: kept.append(figure) or draw(figure))
+    options = ["--folder", str(folder), "--repetitions", "20", "--summary", str(tmp_path / "summary.png")]
+    before = (folder / "results.md").read_bytes()
+    main(["tasks", "axes", *options])
+    assert (tmp_path / "summary.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "results.md").read_bytes() == before
+    left, right = kept[0].axes
+    assert (left.get_title(), right.get_title()) == ("Pendulum-v1", "Pendulum-v1, 4 settings")
+    for panel in (left, right):
+        names = [str(line.get_label()) for line in panel.get_lines() if not str(line.get_label()).startswith("_")]
+        assert names == ["CGP-Online", "TD3", "SAC"]
+    for studies, fault in (
+        (["axes", "tasks"], "must be a study of learning curves"),
+        (["tasks", "tasks"], "one of hyperparameters"),
+    ):
+        with pytest.raises(SystemExit, match=fault):
+            main([*studies, *options])
+    with pytest.raises(SystemExit):
+        main(["tasks", *options])
+    assert "name two studies" in capsys.readouterr().err

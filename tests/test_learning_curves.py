@@ -115,6 +115,24 @@ def test_published_returns_are_hollow_markers_at_their_steps(tmp_path: Path, dra
     (marks,) = (line for line in panel.get_lines() if line.get_label() == "TD3, literature, v1")
     assert (marks.get_markerfacecolor(), marks.get_linestyle()) == ("none", "None")
     assert (marks.get_color(), marks.get_marker()) == (METHODS["TD3"]["color"], METHODS["TD3"]["marker"])
+    low, high = panel.get_ylim()
+    assert low < 10.0 < 8112.0 <= high
+
+
+def test_untrained_policies_do_not_squash_the_curves(tmp_path: Path, drawn: list[Figure]) -> None:
+    """Of evaluations at 250, 500, 750 and 1,000 steps, with 500 random ones, the last two make the vertical axis."""
+    records = [record("CEM", seed, -6.0, returns=[-90.0, -80.0, -10.0 - seed, -6.0]) for seed in range(4)]
+    chosen = study(
+        tmp_path, records, configurations={"CEM": {"algo": "cgp", "learning_starts": 500}, "Random": {"algo": "random"}}
+    )
+    curves_by_steps(chosen, "Pendulum-v1", 20)
+    low, high = drawn[0].axes[0].get_ylim()
+    assert -14 < low < -13
+    assert -6 < high < -5
+    # Where nothing was evaluated after them, all evaluations
+    chosen.facts["configurations"]["CEM"]["learning_starts"] = 1_000
+    curves_by_steps(chosen, "Pendulum-v1", 20)
+    assert drawn[1].axes[0].get_ylim()[0] < -90
 
 
 def test_few_methods_share_a_panel_and_many_have_their_own_beside_one_reference(tmp_path: Path, drawn: list[Figure]) -> None:
@@ -204,7 +222,7 @@ def test_page_of_e10(tmp_path: Path) -> None:
     records = runs(lambda method, *_: level[method] + draw_reward.normal(), E10, seeds=range(5), tasks=FORBIDDEN)
     folder = write_study(tmp_path / "e10", [replace(run, experiment="e10", processor_seconds=60.0) for run in records])
     text = unpadded(figures([folder], tmp_path, 100).read_text())
-    assert "## The study e10" in text
+    assert "## The study e10, " in text
     assert "Seeds 0, 1, 2, 3, 4;" in text
     for task in FORBIDDEN:
         for method in E10:
@@ -216,7 +234,8 @@ def test_page_of_e10(tmp_path: Path) -> None:
             assert finals[0] - 0.06 <= float(low) < float(value) < float(high) <= finals[4] + 0.06
     assert "| all tasks (2) | CGP-Online − TD3 |" in text
     # Its tasks are not those of the paper's claims
-    claims = text[text.index("## The paper's claims") : text.index("## Does CGP-Light lose")]
+    claims = text[text.index("## The paper's claims") : text.index("## How to read")]
+    assert "online training" in claims
     assert "ForbiddenPendulum" not in claims
     assert {path.name for path in (tmp_path / "figures" / "e10").iterdir()} == {
         "final_rewards.png",

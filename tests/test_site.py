@@ -77,16 +77,21 @@ GOOD = (
     '<h1 id="top">A</h1><a href="b.html#part">b</a><a href="#top">up</a><img src="i.png"><a href="https://example.org">out</a>'
 )
 
+FIGURE = '<div data-figure="f"></div><script type="application/json" id="f">{"data": [1], "layout": 1}</script>'
+
 
 @pytest.fixture
 def site(tmp_path):
     (tmp_path / "a.html").write_text(GOOD)
     (tmp_path / "b.html").write_text('<h1 id="part">B</h1><img src="data:image/png;base64,AA==">')
     (tmp_path / "i.png").write_bytes(b"")
+    (tmp_path / "plotly.js").write_text("")
     return tmp_path
 
 
 def test_a_whole_site_has_no_fault(site):
+    assert list(CHECK(site)) == []
+    (site / "c.html").write_text(f'<script src="plotly.js"></script>{FIGURE}')
     assert list(CHECK(site)) == []
 
 
@@ -99,6 +104,10 @@ def test_a_whole_site_has_no_fault(site):
         ('<img src="j.png">', "a.html: j.png: no such file"),
         ('<script src="https://cdn.example.org/x.js"></script>', "a.html: loads https://cdn.example.org/x.js from a network"),
         ('<link rel="stylesheet" href="//example.org/x.css">', "a.html: loads //example.org/x.css from a network"),
+        ('<script src="plotly.js"></script><div data-figure="f"></div>', "a.html: f: no data"),
+        (f'<script src="plotly.js"></script>{FIGURE.replace("1}", "1")}', "a.html: f: no data"),
+        (f'<script src="plotly.js"></script>{FIGURE.replace("[1]", "[]")}', "a.html: f: no data"),
+        (FIGURE, "a.html: loads plotly.js 0 times"),
     ],
 )
 def test_a_fault_of_a_site_is_named(site, broken, fault):
@@ -108,3 +117,49 @@ def test_a_fault_of_a_site_is_named(site, broken, fault):
 
 def test_a_folder_without_pages_is_a_fault(tmp_path):
     assert list(CHECK(tmp_path)) == [f"{tmp_path}: no page"]
+
+
+@pytest.fixture(scope="module")
+def diagrams():
+    return runpy.run_path(str(ROOT / "docs" / "draw_diagrams.py"))
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("sequenceDiagram\n a --> b", "must be 'flowchart BT'"),
+        ("flowchart LR\n a ==> b", "must be name"),
+        ("flowchart BT\n a --> b\n b --> a", "are a circle"),
+    ],
+)
+def test_a_diagram_that_cannot_be_drawn_is_named(text, fault, diagrams):
+    with pytest.raises(Exception, match=fault):
+        diagrams["svg"](text)
+
+
+def test_boxes_of_a_diagram_stand_in_the_order_of_the_arrows_without_overlap(diagrams):
+    chart = diagrams["parse"]('flowchart BT\n a["<b>A</b><br>first & last --> x"] --> b & c --> d\n a --> d')
+    assert chart.arrows == [("a", "b"), ("a", "c"), ("b", "d"), ("c", "d"), ("a", "d")]
+    width, height = diagrams["place"](chart)
+    boxes = chart.boxes
+    assert (boxes["a"].lines, boxes["a"].bold) == (["A", "first & last --> x"], 1)
+    assert boxes["a"].y > boxes["b"].y == boxes["c"].y > boxes["d"].y
+    assert boxes["b"].x + boxes["b"].width / 2 < boxes["c"].x - boxes["c"].width / 2
+    for box in boxes.values():
+        assert 0 <= box.x - box.width / 2 < box.x + box.width / 2 <= width
+        assert -1e-9 <= box.y - box.height / 2 < box.y + box.height / 2 <= height + 1e-9
+
+
+def test_a_diagram_shows_every_name_and_every_arrow(diagrams):
+    drawn = diagrams["svg"]('flowchart LR\n a["<i>"] --> b --> c\n c -. "back & forth" .-> a')
+    assert drawn.count("<rect") == 3
+    assert "&lt;i&gt;" in drawn
+    assert "back &amp; forth" in drawn
+    assert drawn.partition('class="arrow"')[2].count("<path") == 3
+
+
+def test_diagrams_of_all_pages_can_be_drawn(diagrams):
+    blocks = [block for page in PAGES for block in re.findall(r"```mermaid\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)]
+    assert blocks
+    for block in blocks:
+        assert diagrams["svg"](block).startswith('<div class="wide"><svg')

@@ -26,7 +26,7 @@ IMITATED = "CEM"
 # The beginnings of the names of CGP's variants, which are no rivals of it
 VARIANTS = ("CGP", "QGP")
 # Experiments of this project, on tasks that the paper's claims are not about
-NOT_THE_PAPERS = ("e10",)
+NOT_THE_PAPERS = (10,)
 BASELINES = ("TD3", "SAC", "DDPG")
 # The difference that counts as none, as a share of the task's range
 MARGIN = 0.05
@@ -116,11 +116,12 @@ def narrower(table: pd.DataFrame, repetitions: int) -> list[Part]:
         )
         if found is not None:
             ours, theirs = _each(usual, pair, interquartile_range)
-            text = f"{ours:.3f} against {baseline}'s {theirs:.3f}, less by {found.in_words('.3f')}"
+            text = f"range {ours:.3f} against {baseline}'s {theirs:.3f}: narrower by {found.in_words('.3f')}"
+            note = ""
             if len(in_common(usual, pair)) < len(in_common(table, pair)):
                 ours, theirs = _each(table, pair, interquartile_range)
-                text += f" (learning rates from {HIGH_LEARNING_RATE:g} on included, {ours:.3f} against {theirs:.3f})"
-            parts.append(Part(text, judge(found, more_than=0)))
+                note = f"learning rates from {HIGH_LEARNING_RATE:g} on included, {ours:.3f} against {theirs:.3f}"
+            parts.append(Part(text, judge(found, more_than=0), note))
     return parts
 
 
@@ -136,7 +137,7 @@ def imitation(table: pd.DataFrame, repetitions: int) -> list[Part]:
     if found is None:
         return []
     ours, theirs = _each(table, (OURS, IMITATED), interquartile_mean)
-    text = f"{ours:.2f} against {IMITATED}'s {theirs:.2f}, more by {found.in_words('.3f')}"
+    text = f"interquartile mean {ours:.2f} against {IMITATED}'s {theirs:.2f}: higher by {found.in_words('.3f')}"
     return [Part(text, judge(found, more_than=-MARGIN))]
 
 
@@ -164,9 +165,8 @@ def inference_cost(runtime: dict[str, Any] | None, repetitions: int) -> list[Par
     found = estimate(lambda ratios: np.median(ratios, axis=1), [[ours[many] / ours[few]]], repetitions)
     text = f"by `benchmark.runtime`, acting after {many} iterations takes {found.in_words()} times as long as after {few}"
     cem = seconds("CEM-")
-    if {few, many} <= set(cem):
-        text += f" (CEM itself {np.median(cem[many] / cem[few]):.2f} times)"
-    return [Part(text, judge(found, more_than=1 - COST_MARGIN, less_than=1 + COST_MARGIN))]
+    note = f"CEM itself {np.median(cem[many] / cem[few]):.2f} times" if {few, many} <= set(cem) else ""
+    return [Part(text, judge(found, more_than=1 - COST_MARGIN, less_than=1 + COST_MARGIN), note)]
 
 
 def equal_variants(table: pd.DataFrame, repetitions: int) -> list[Part]:
@@ -225,7 +225,8 @@ def online_better(table: pd.DataFrame, repetitions: int) -> list[Part]:
     for kind in ("CGP", "QGP"):
         found = compare(table, (f"{kind}-Online", f"{kind}-Offline"), difference, repetitions=repetitions)
         if found is not None:
-            parts.append(Part(f"{kind}: more by {found.in_words('.3f')}", judge(found, more_than=0)))
+            text = f"{kind}-Online is higher than {kind}-Offline by {found.in_words('.3f')}"
+            parts.append(Part(text, judge(found, more_than=0)))
     return parts
 
 

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib import colormaps
+from matplotlib.collections import LineCollection
 
+from benchmark.common.canvas import BAND, SEED, count_steps, draw_line, legend, panels, png, styled
 from benchmark.common.style import styles
-from benchmark.reporting.canvas import BAND, draw_line, label_steps, legend, panels, png, styled
 from benchmark.reporting.comparisons import RANDOM
 from benchmark.reporting.estimates import (
     REPETITIONS,
@@ -23,7 +24,7 @@ from benchmark.reporting.scores import Study, axis_in_words, curves, evaluation_
 LINE_STYLES: list[Any] = ["-", "--", "-.", ":", (0, (4, 1, 1, 1, 1, 1)), (0, (8, 2))]
 MARKERS = "osD^vXP"
 # Methods differ where the highest and the lowest of their shares are this far apart
-DIFFERENCE = 0.1
+DIFFERENCE = 0.15
 
 
 @styled
@@ -37,7 +38,7 @@ def stability(table: pd.DataFrame, methods: Sequence[str], repetitions: int = RE
     :return: the picture, as PNG
     """
     tasks = list(dict.fromkeys(table["task"]))
-    figure, grid = panels(len(tasks), columns=min(len(tasks), 2), size=(5.0, 3.4))
+    figure, grid = panels(len(tasks), columns=min(len(tasks), 2), size=(5.0, 3.0) if len(tasks) == 1 else (3.7, 2.8))
     for task, panel in zip(tasks, grid, strict=True):
         runs = table[table["task"] == task]
         levels, shares = np.unique(runs["score"]), []
@@ -74,8 +75,8 @@ def differing_range(levels: np.ndarray, shares: np.ndarray) -> tuple[float, floa
 @styled
 def sensitivity(study: Study, task: str) -> bytes:
     """
-    Draw a task's learning curves for each configuration, means over seeds: a column of panels for each method, a row for each
-    combination of values of all axes but the last, and a line for each value of the last axis.
+    Draw a task's learning curves for each configuration, interquartile means over seeds and every seed: a column of panels for
+    each method, a row for each combination of values of all axes but the last, and a line for each value of the last axis.
 
     :param study: the study, with an axis
     :param task: the task
@@ -86,7 +87,7 @@ def sensitivity(study: Study, task: str) -> bytes:
     methods = [method for method in study.methods if any(record.method == method for record in records)]
     *row_axes, (last, last_values) = study.axes.items()
     rows = sorted({study.place(record.settings)[:-1] for record in records})
-    figure, drawn = panels(len(methods) * len(rows), columns=len(methods), size=(2.7, 2.5))
+    figure, drawn = panels(len(methods) * len(rows), columns=len(methods), size=(2.0, 2.1))
     colors = colormaps["viridis"](np.linspace(0.0, 0.85, len(last_values)))
     for number, panel in enumerate(drawn):
         row, method = rows[number // len(methods)], methods[number % len(methods)]
@@ -97,17 +98,18 @@ def sensitivity(study: Study, task: str) -> bytes:
             if chosen and len(grid) > 0:
                 look = dict(color=colors[place], linestyle=LINE_STYLES[place % len(LINE_STYLES)])
                 look["marker"] = MARKERS[place % len(MARKERS)]
-                draw_line(panel, grid, curves(chosen, floor, grid).mean(axis=0), value_in_words(value), look)
+                lines = curves(chosen, floor, grid)
+                draw_line(panel, grid, interquartile_mean(lines[None])[0], value_in_words(value), look)
+                seeds = [np.column_stack([grid, line]) for line in lines]
+                panel.add_collection(LineCollection(seeds, colors=[colors[place]], linewidths=0.6, alpha=SEED["alpha"]))
         if number < len(methods):
             panel.set_title(method)
-        label_steps(panel)
-        if number // len(methods) < len(rows) - 1:
-            panel.set_xlabel("")
         if number % len(methods) == 0:
             names = [
                 f"{axis_in_words(axis)} {value_in_words(values[at])}" for (axis, values), at in zip(row_axes, row, strict=True)
             ]
             panel.set_ylabel("\n".join([*names, "return"]))
+    count_steps(drawn)
     legend(figure, drawn, f"{task}: {axis_in_words(last)}")
     return png(figure)
 
@@ -123,7 +125,7 @@ def values(study: Study, table: pd.DataFrame, task: str, repetitions: int = REPE
     :param repetitions: number of bootstrap samples
     :return: the picture, as PNG
     """
-    figure, grid = panels(len(study.axes), size=(4.4, 3.2))
+    figure, grid = panels(len(study.axes), size=(3.7, 2.9))
     looks = styles(study.methods)
     for (axis, axis_values), panel in zip(study.axes.items(), grid, strict=True):
         for number, (method, look) in enumerate(looks.items()):
@@ -161,14 +163,14 @@ def final_rewards(study: Study, table: pd.DataFrame, repetitions: int = REPETITI
     """
     tasks = list(dict.fromkeys(table["task"]))
     methods = [method for method in study.methods if method != RANDOM] or study.methods
-    figure, grid = panels(len(tasks), share=True, size=(4.2, 0.7 + 0.36 * len(methods)))
+    figure, grid = panels(len(tasks), share=True, size=(3.7, 0.9 + 0.3 * len(methods)))
     for task, panel in zip(tasks, grid, strict=True):
         for place, (method, look) in enumerate(styles(methods).items()):
             runs = table[(table["task"] == task) & (table["method"] == method)]
             if runs.empty:
                 continue
             found = estimate(interquartile_mean, [cells_of(runs, "score")], repetitions)
-            panel.plot(runs["score"], [place + 0.3] * len(runs), "|", color=look["color"], markersize=6)
+            panel.plot(runs["score"], [place + 0.3] * len(runs), "|", color=look["color"], markersize=8)
             panel.plot(found.value, place, marker=look["marker"], color=look["color"], markersize=7)
             if found.interval is not None:
                 panel.plot(found.interval, [place, place], color=look["color"], linewidth=2.5, alpha=0.5)

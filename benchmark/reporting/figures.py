@@ -1,10 +1,8 @@
 """The figures of studies, which follow from their runs, and the page that shows them with the commands that draw them."""
 
-import dataclasses
 import itertools
 import json
 import re
-import shlex
 import zlib
 from collections import Counter
 from collections.abc import Sequence
@@ -13,34 +11,36 @@ from typing import Any
 
 from benchmark.common.records import RUNS
 from benchmark.reporting.claims import NOT_THE_PAPERS, findings
+from benchmark.reporting.commands import FIGURES_ONLY, FOLDER, command_line, with_results_folder
 from benchmark.reporting.comparisons import experiments_section
 from benchmark.reporting.drawing import final_rewards, sensitivity, stability, values
 from benchmark.reporting.estimates import REPETITIONS
 from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, timed_runs
 from benchmark.reporting.light import light_section
 from benchmark.reporting.literature import published
-from benchmark.reporting.page import Picture, claims_section, page, pooled_section, study_section
-from benchmark.reporting.scores import Study, axis_in_words, longest, read_study, score_table
+from benchmark.reporting.overview import overview
+from benchmark.reporting.page import claims_section, introduction, page, pooled_section
+from benchmark.reporting.scores import Study, axis_in_words, experiment_number, longest, read_study, score_table
+from benchmark.reporting.sections import Picture, study_sections
 from sb3_cgp.common.files import write_atomically
 
-# Not tracked by git, unlike this repository's own results in benchmark/results/sweeps
-FOLDER = Path("results/sweeps")
 RUNTIME = Path(__file__).parent.parent / "results/runtime/runtime.json"
 PAGE = "results.md"
 FIGURES = "figures"
-FIGURES_ONLY = "--figures-only"
 CURVES = (
     "Learning curves on {}: every seed (thin), the interquartile mean over seeds (bold), and its 95 % interval (band). "
-    "Until an offline variant's policy is trained, at the end, its curve is CEM's."
+    "Until an offline variant's policy is trained, at the end, its curve is CEM's. The vertical axis is that of the "
+    "evaluations after the random steps at the start; untrained policies may be below it."
 )
 LITERATURE = " Hollow markers are mean returns from the literature, on other versions of the environment (table below)."
 MINUTES = (
     "The same on {} by minutes of processor time, of all threads, evaluations included. A run's evaluation is placed at the "
     "run's time times the evaluation's step divided by the run's steps, and a method's curve at the mean over its runs."
 )
+SENSITIVITY = "learning curves, every seed (thin) and the interquartile mean over seeds (bold), on one vertical scale."
 STABILITY = (
     "Stability: the share of runs, {}, that reach at least a final reward, with pointwise 95 % bands, "
-    "from the lowest reward on at which methods are more than 10 % apart."
+    "from the lowest reward on at which methods are more than 15 percentage points apart."
 )
 
 
@@ -76,25 +76,50 @@ def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPE
     for picture in [*together, *itertools.chain(*pictures)]:
         write_atomically(out / picture.path, picture.content)
     if with_page:
-        papers = [study for study in in_earnest if study.facts["experiment"] not in NOT_THE_PAPERS]
-        found = findings(score_table(papers), read_runtime(out), repetitions)
-        command = command_line(folders, out, repetitions)
-        answers = list(filter(None, [light_section(studies), experiments_section(in_earnest, repetitions)]))
-        claims = claims_section(found)
-        pooled = [pooled_section(picture, f"{command} {FIGURES_ONLY}") for picture in together]
-        results = []
-        for study, own in zip(studies, pictures, strict=True):
-            # A study's figures depend on nothing else
-            drawing = f"{command_line([study.folder], out, repetitions)} {FIGURES_ONLY}"
-            results.append(study_section(with_results_folder(study, out), own, drawing, repetitions))
-        if any(is_papers(study) for study in studies):
-            sections = [claims, *answers, *pooled, *results]
-        else:
-            # The user's findings come first, and the paper's claims last
-            sections = [*answers, *results, claims, *pooled]
-        sections.append(f"`{command}` writes this page.")
-        write_atomically(out / PAGE, page(sections).encode())
+        write_atomically(out / PAGE, page_of(studies, in_earnest, together, pictures, out, repetitions).encode())
     return out / PAGE
+
+
+def page_of(
+    studies: Sequence[Study],
+    in_earnest: Sequence[Study],
+    together: Sequence[Picture],
+    pictures: Sequence[Sequence[Picture]],
+    out: Path,
+    repetitions: int,
+) -> str:
+    """
+    Write the page of studies.
+
+    :param studies: the studies
+    :param in_earnest: those of them that claims rest on
+    :param together: the figures of several studies together
+    :param pictures: the figures of each study
+    :param out: the folder of the page and the figures
+    :param repetitions: number of bootstrap samples
+    :return: the page, in Markdown
+    """
+    papers = [study for study in in_earnest if experiment_number(study) not in NOT_THE_PAPERS]
+    claims = claims_section(findings(score_table(papers), read_runtime(out), repetitions))
+    folders = [study.folder for study in studies]
+    command = command_line([] if folders == study_folders(out) else folders, out, repetitions)
+    found = [
+        overview(studies, repetitions),
+        light_section(studies),
+        experiments_section(in_earnest, repetitions),
+    ]
+    pooled = [pooled_section(picture, f"{command} {FIGURES_ONLY}") for picture in together]
+    results = []
+    for study, own in zip(studies, pictures, strict=True):
+        # A study's figures depend on nothing else
+        drawing = f"{command_line([study.folder], out, repetitions)} {FIGURES_ONLY}"
+        results += study_sections(with_results_folder(study, out), own, drawing, out, repetitions)
+    if any(is_papers(study) for study in studies):
+        sections = [introduction(studies), claims, *found, *pooled, *results]
+    else:
+        # The user's findings come first, and the paper's claims last
+        sections = [introduction(studies), *found, *results, claims, *pooled]
+    return page(list(filter(None, sections)), command)
 
 
 def is_papers(study: Study) -> bool:
@@ -104,52 +129,7 @@ def is_papers(study: Study) -> bool:
     :param study: the study
     :return: whether it is of E1 to E8, whatever its tasks and lengths
     """
-    return re.fullmatch(r"e\d+", study.facts["experiment"]) is not None and study.facts["experiment"] not in NOT_THE_PAPERS
-
-
-def with_results_folder(study: Study, out: Path) -> Study:
-    """
-    Return a study whose commands name the folder of the results, which their records leave out as private.
-
-    :param study: the study
-    :param out: the folder of the page and the figures
-    :return: the study; unchanged where the folder is the default of ``benchmark.sweep``
-    """
-    if shown(out) == FOLDER.as_posix():
-        return study
-    commands = [
-        {**command, "command": f"{command['command']} {shlex.join(['--results', shown(out)])}"}
-        for command in study.facts["commands"]
-    ]
-    return dataclasses.replace(study, facts={**study.facts, "commands": commands})
-
-
-def shown(path: Path) -> str:
-    """
-    Return a path as commands name it.
-
-    :param path: the path
-    :return: the path from the present folder, if it is in there
-    """
-    here = Path.cwd()
-    return (path.resolve().relative_to(here) if path.resolve().is_relative_to(here) else path).as_posix()
-
-
-def command_line(folders: Sequence[Path], out: Path, repetitions: int) -> str:
-    """
-    Return the command that draws the same figures.
-
-    :param folders: the studies' folders
-    :param out: the folder of the page and the figures
-    :param repetitions: number of bootstrap samples
-    :return: the command
-    """
-    arguments = [shown(folder) for folder in folders]
-    if shown(out) != FOLDER.as_posix():
-        arguments += ["--folder", shown(out)]
-    if repetitions != REPETITIONS:
-        arguments += ["--repetitions", str(repetitions)]
-    return shlex.join(["python", "-m", "benchmark.figures", *arguments])
+    return experiment_number(study) not in (None, *NOT_THE_PAPERS)
 
 
 def read_runtime(out: Path) -> dict[str, Any] | None:
@@ -179,7 +159,8 @@ def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
 
     def picture(kind: str, caption: str, content: bytes, task: str | None = None) -> Picture:
         name = kind if task is None else f"{kind}_{names[task]}"
-        return Picture(f"{FIGURES}/{study.name}/{name}.png", caption, content)
+        title = f"{kind.replace('_', ' ').capitalize()}, {task or ', '.join(study.tasks)}"
+        return Picture(f"{FIGURES}/{study.name}/{name}.png", title, caption, content, task)
 
     if not study.axes:
         pictures = []
@@ -197,7 +178,7 @@ def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
     caption = STABILITY.format("of all configurations and seeds")
     pictures = [picture("stability", caption, stability(table, study.methods, repetitions))]
     for task in study.tasks:
-        lines = f"Sensitivity to {axes} on {task}: learning curves, means over seeds, on one vertical scale."
+        lines = f"Sensitivity to {axes} on {task}: {SENSITIVITY}"
         pictures.append(picture("sensitivity", lines, sensitivity(study, task), task))
         points = f"Final rewards on {task} by {axes}: interquartile means over all runs with a value, and 95 % intervals."
         pictures.append(picture("values", points, values(study, table, task, repetitions), task))
@@ -256,4 +237,5 @@ def stability_together(studies: Sequence[Study], repetitions: int = REPETITIONS)
         return []
     methods = list(dict.fromkeys(method for study in largest for method in study.methods))
     caption = STABILITY.format(f"of all sweeps ({', '.join(study.name for study in largest)}) that name the method")
-    return [Picture(f"{FIGURES}/stability.png", caption, stability(score_table(largest), methods, repetitions))]
+    title = "Stability of all sweeps together"
+    return [Picture(f"{FIGURES}/stability.png", title, caption, stability(score_table(largest), methods, repetitions))]

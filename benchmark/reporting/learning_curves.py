@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmark.common.canvas import BAND, count_steps, draw_line, draw_seeds, label_below, legend, panels, png, styled
 from benchmark.common.records import Record
 from benchmark.common.style import styles
-from benchmark.reporting.canvas import BAND, SEED, draw_line, label_steps, legend, panels, png, styled
 from benchmark.reporting.comparisons import RANDOM
 from benchmark.reporting.estimates import REPETITIONS, bootstrap, interquartile_mean
 from benchmark.reporting.literature import Published, published
@@ -19,7 +19,7 @@ from benchmark.reporting.scores import Study, curves, evaluation_grid, failed, f
 MOST = 4
 REFERENCE = "TD3"
 BESIDE: dict[str, Any] = dict(color="#8A8A8A", linestyle="--", linewidth=1.6)
-ALONE = (6.6, 4.0)
+ALONE = (5.6, 3.6)
 
 
 @styled
@@ -35,12 +35,13 @@ def curves_by_steps(study: Study, task: str, repetitions: int = REPETITIONS) -> 
     """
     records = [record for record in study.records if record.task == task]
     figure, drawn = _figure(study, task, records, dict.fromkeys(study.methods, 1.0), repetitions)
-    for panel in drawn.values():
-        label_steps(panel)
+    count_steps(list(drawn.values()))
     for entry in published(task, study.facts["steps"]):
         place = entry.method if entry.method in drawn else ""
         if place in drawn:
             _mark(drawn[place], entry)
+            means = [mean for mean, _ in entry.returns.values()]
+            drawn[place].set_ylim(learnt_range(np.array([*drawn[place].get_ylim(), *means]), margin=0.0))
     legend(figure, list(drawn.values()), task)
     return png(figure)
 
@@ -57,8 +58,7 @@ def curves_by_minutes(study: Study, task: str, repetitions: int = REPETITIONS) -
     """
     records, minutes_per_step = timed_runs(study, task)
     figure, drawn = _figure(study, task, records, minutes_per_step, repetitions)
-    for panel in drawn.values():
-        panel.set_xlabel("minutes of processor time")
+    label_below(list(drawn.values()), "minutes of processor time")
     legend(figure, list(drawn.values()), task)
     return png(figure)
 
@@ -115,11 +115,11 @@ def _figure(
         if len(grid) == 0:
             continue
         if not is_alone:
-            panel.set_title(_label(study, method, runs))
+            panel.set_title(_label(study, method, runs).replace(" (", "\n("))
             if method != reference:
                 beside = interquartile_mean(lines[reference][None])[0]
                 panel.plot(grid * units_per_step[reference], beside, label=f"{reference}, in all panels", **BESIDE)
-        panel.plot(x, lines[method].T, color=looks[method]["color"], label="_seed", **SEED)
+        draw_seeds(panel, x, lines[method], looks[method]["color"])
         middle, interval = bootstrap(interquartile_mean, [[lines[method]]], repetitions)
         label, look = (
             (_label(study, method, runs), looks[method]) if is_alone else ("_method", looks[method] | {"linestyle": "-"})
@@ -129,7 +129,34 @@ def _figure(
             panel.fill_between(x, *interval, color=looks[method]["color"], **BAND)
     for panel in axes[:: 1 if is_alone else 3]:
         panel.set_ylabel("return")
+    trained = [line[:, grid > first_training_step(study)] for line in lines.values()]
+    if any(line.size for line in trained):
+        axes[0].set_ylim(learnt_range(np.concatenate([line.ravel() for line in trained])))
     return figure, drawn
+
+
+def first_training_step(study: Study) -> int:
+    """
+    Return the step at which the last method of a study begins to learn.
+
+    :param study: the study
+    :return: the most random steps at the start that one of its configurations takes
+    """
+    configurations = study.facts.get("configurations", {}).values()
+    return max((int(entry.get("learning_starts", 0)) for entry in configurations), default=0)
+
+
+def learnt_range(returns: np.ndarray, margin: float = 0.04) -> tuple[float, float]:
+    """
+    Return the range of the vertical axis.
+
+    :param returns: the returns of all evaluations after the first training step (N), at least one
+    :param margin: the margin on each side, as a share of their range
+    :return: their range, with the margin
+    """
+    low, high = float(returns.min()), float(returns.max())
+    beyond = margin * (high - low) if high > low else 1.0
+    return low - beyond, high + beyond
 
 
 def _mark(panel: Axes, entry: Published) -> None:

@@ -90,4 +90,4 @@ def literature_section(tasks: Sequence[str], steps: int) -> list[str]:
     ]
     sources = dict.fromkeys(f"- {entry.method}, {entry.seeds} seeds: {entry.source}" for entry in entries)
     table = markdown_table(["task", "method", "steps", "return"], rows)
-    return ["### From the literature", table, NOTE, "\n".join(sources)]
+    return ["**From the literature**", table, NOTE, "\n".join(sources)]

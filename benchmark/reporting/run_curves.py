@@ -1,6 +1,5 @@
 """The learning curve of a training run of rl_zoo3, as its evaluations or its monitors recorded it."""
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,8 +7,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 from stable_baselines3.common.monitor import get_monitor_files, load_results
+
+from benchmark.common.canvas import BAND, count_steps, legend, panels, png, styled
+from benchmark.common.style import METHODS
 
 # A curve drawn from training episodes joins them into at most so many points
 TRAINING_POINTS = 50
@@ -93,6 +94,7 @@ def training_seconds(folder: Path) -> float | None:
     return float(episodes["t"].max()) if len(episodes) > 0 else None
 
 
+@styled
 def draw_curve(record: dict[str, Any]) -> bytes:
     """
     Draw a learning curve, its mean with a band of one standard deviation over episodes, and the final evaluation.
@@ -101,18 +103,14 @@ def draw_curve(record: dict[str, Any]) -> bytes:
     :return: the picture, as PNG
     """
     curve, final = record["curve"], record["final"]
-    mean, std = np.array(curve["mean"]), np.array(curve["std"])
-    # No pyplot: its global figure list and its choice of a screen back-end are of no use here
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
-    axes = figure.add_subplot()
-    (line,) = axes.plot(curve["timesteps"], mean, label=f"{curve['source']}, mean ± std")
-    axes.fill_between(curve["timesteps"], mean - std, mean + std, alpha=0.2, color=line.get_color())
-    axes.errorbar(
-        record["steps"], final["mean"], final["std"], fmt="o", capsize=4, label=f"final model, {final['episodes']} episodes"
-    )
-    axes.set(title=f"{record['algo']} on {record['env']}, seed {record['seed']}", xlabel="environment steps", ylabel="return")
-    axes.grid(alpha=0.3)
-    axes.legend()
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=150)
-    return picture.getvalue()
+    steps, mean, std = (np.array(curve[name], dtype=float) for name in ("timesteps", "mean", "std"))
+    figure, (panel,) = panels(1, size=(5.6, 3.4))
+    color = METHODS["CGP-Online"]["color"]
+    panel.plot(steps, mean, label=f"{curve['source']}, mean ± std", color=color)
+    panel.fill_between(steps, mean - std, mean + std, color=color, **BAND)
+    label = f"final model, {final['episodes']} episodes"
+    panel.errorbar(record["steps"], final["mean"], final["std"], fmt="o", capsize=4, label=label, color="black", clip_on=False)
+    panel.set(title=f"{record['algo']} on {record['env']}, seed {record['seed']}", ylabel="return")
+    count_steps([panel])
+    legend(figure, [panel])
+    return png(figure)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -81,6 +82,17 @@ class Study:
             return tasks.index(record.task), self.place(record.settings), methods.index(record.method), record.seed
 
         return sorted(self.records, key=key)
+
+
+def experiment_number(study: Study) -> int | None:
+    """
+    Return the number of this project's experiment that a study is of.
+
+    :param study: the study
+    :return: such as 10 for the experiments e10 and e10-quick; None for the experiment of a user
+    """
+    number = re.fullmatch(r"e(\d+)(-.*)?", study.facts["experiment"])
+    return int(number[1]) if number else None
 
 
 def read_study(folder: Path) -> Study:

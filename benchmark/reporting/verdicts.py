@@ -21,10 +21,17 @@ class Part:
 
     :param text: the comparison and its result
     :param verdict: the verdict on the claim
+    :param note: a further result, on which the verdict does not rest
     """
 
     text: str
     verdict: str
+    note: str = ""
+
+    @property
+    def whole_text(self) -> str:
+        """The comparison with its note."""
+        return self.text + f" ({self.note})" * bool(self.note)
 
 
 @dataclass(frozen=True)
@@ -50,11 +57,20 @@ class Finding:
         return SUPPORTED if set(verdicts) == {SUPPORTED} else NOT_DECIDED
 
     @property
+    def evidence(self) -> str:
+        """The comparison that the verdict rests on: of several, the first with the verdict of all together."""
+        if not self.parts:
+            return ""
+        deciding = next(part for part in self.parts if part.verdict == self.verdict)
+        alike = sum(part.verdict == self.verdict for part in self.parts)
+        return deciding.text + f"; {self.verdict} in {alike} of {len(self.parts)} comparisons" * (len(self.parts) > 1)
+
+    @property
     def text(self) -> str:
         """The text of all parts, each with its verdict if there are several."""
         if len(self.parts) == 1:
-            return self.parts[0].text
-        return "; ".join(f"{part.text}: {part.verdict}" for part in self.parts)
+            return self.parts[0].whole_text
+        return "; ".join(f"{part.whole_text}: {part.verdict}" for part in self.parts)
 
 
 def judge(found: Estimate, more_than: float = -np.inf, less_than: float = np.inf) -> str:

@@ -1,15 +1,13 @@
 """The page and the figure of the bias of critics' values."""
 
-import io
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
 
+from benchmark.common.canvas import count_steps, draw_line, draw_seeds, label_ends, panels, png, styled
 from benchmark.common.provenance import conditions_in_words
 from benchmark.common.style import styles
 from benchmark.common.tables import markdown_table
@@ -17,6 +15,19 @@ from benchmark.values.episodes import TAIL, horizon
 from benchmark.values.methods import EXPLORATION_NOISE, LEARNING_RATE, MAIN, VARIANTS
 
 Point = dict[str, Any]
+Value = Callable[[Point], float | None]
+# The methods that share a row of panels
+ROWS = (
+    [method for method in MAIN if method.removeprefix("CGP-").isdecimal()],
+    ["CGP-2", "CGP-Light", "TD3"],
+    ["CGP-2", *list(VARIANTS)[:2]],
+    ["CGP-2", *list(VARIANTS)[2:]],
+)
+FIGURE = """\
+![The bias of the critics' values, and the return of the actor](bias.png)
+
+*The bias (left) and the return of the actor (right) by environment steps: every seed (thin), and the mean over the seeds
+(bold). The names at the right end are those of the whole row.*"""
 
 NOTES = f"""\
 Bias: the first critic's value Q_1 of a state and of the action taken in it, less the discounted return that followed.
@@ -69,7 +80,7 @@ def late(run: dict[str, Any]) -> list[Point]:
     return [point for point in run["points"] if 2 * point["steps"] > run["settings"]["steps"]]
 
 
-def cell(runs: Iterable[dict[str, Any]], policy: str, value: Callable[[Point], float | None]) -> str:
+def cell(runs: Iterable[dict[str, Any]], policy: str, value: Value) -> str:
     """
     Return a cell of the table: the mean of the seeds' means, and their range.
 
@@ -134,7 +145,8 @@ def markdown(records: list[dict[str, Any]]) -> str:
         error_bound=max((bound for bound in bounds if bound is not None), default=0.0),
     )
     conditions = f"The first run: {conditions_in_words(records[0])}"
-    return "\n\n".join(["# The bias of the critics' values", markdown_table(header, rows), notes, conditions]) + "\n"
+    parts = ["# The bias of the critics' values", markdown_table(header, rows), FIGURE, notes, conditions]
+    return "\n\n".join(parts) + "\n"
 
 
 def looks(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
@@ -157,41 +169,46 @@ def looks(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
     return chosen
 
 
+@styled
 def draw(records: list[dict[str, Any]]) -> bytes:
     """
-    Draw the bias, and the actor's return, by environment steps: means over seeds, and their ranges.
+    Draw the bias, and the actor's return, by environment steps: every seed, and the mean over seeds.
 
     :param records: the runs, with the same settings
-    :return: the picture, as PNG: a row for the methods, and a row for the variants of CGP-2
+    :return: the picture, as PNG: a row for each group of methods
     """
-    # No pyplot: its global figure list and its choice of a screen back-end are of no use here
-    figure = Figure(figsize=(9.5, 7.0), layout="constrained")
-    grid = figure.subplots(2, 2, sharex=True)
-    rows = ("methods", list(MAIN)), ("variants of CGP-2", ["CGP-2", *VARIANTS])
-    for (left, right), (title, methods) in zip(grid, rows, strict=True):
-        _draw_panel(left, records, methods, first_bias)
-        _draw_panel(right, records, methods, lambda measured: measured["return"])
+    run = {record["method"] for record in records}
+    rows = [[method for method in row if method in run] for row in ROWS]
+    rows = [row for row in rows if row]
+    figure, grid = panels(2 * len(rows), share=False, columns=2, size=(3.6, 2.0))
+    for row, left, right in zip(rows, grid[::2], grid[1::2], strict=True):
+        left.sharey(grid[0])
+        right.sharey(grid[1])
+        _draw_panel(left, records, row, first_bias)
+        _draw_panel(right, records, row, lambda measured: measured["return"])
         left.axhline(0.0, color="black", linewidth=0.8)
-        left.set(title=f"{title}: bias", ylabel="value less discounted return")
-        right.set(title=f"{title}: return", ylabel="return of the actor")
-        if any(record["method"] in methods for record in records):
-            left.legend(fontsize="small", frameon=False)
-    for axes in grid[1]:
-        axes.set_xlabel("environment steps")
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=120)
-    return picture.getvalue()
+        left.set_ylabel("bias")
+        right.set_ylabel("return")
+    count_steps(grid)
+    chosen = looks(list(run))
+    for row, right in zip(rows, grid[1::2], strict=True):
+        ends = {method: _means(records, method, lambda measured: measured["return"])[1] for method in row}
+        label_ends(right, {method: (float(line[-1]), chosen[method]["color"]) for method, line in ends.items() if len(line)})
+    return png(figure)
 
 
-def _draw_panel(axes: Axes, records: list[dict[str, Any]], methods: list[str], value: Callable[[Point], float | None]) -> None:
-    """Draw a line of means over seeds, and a band of their range, for each method."""
+def _means(records: list[dict[str, Any]], method: str, value: Value) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """Return the steps (E) of a method's measurements, the means over seeds (E), and each seed's values (N, E)."""
+    runs = [record for record in records if record["method"] == method]
+    steps = [point["steps"] for point in runs[0]["points"]]
+    lines = np.array([[value(point["actor"]) for point in run["points"]] for run in runs], dtype=float)
+    return steps, lines.mean(axis=0), lines
+
+
+def _draw_panel(panel: Axes, records: list[dict[str, Any]], methods: list[str], value: Value) -> None:
+    """Draw each seed, and a line of means over seeds, for each method."""
     for method, look in looks(methods).items():
-        runs = [record for record in records if record["method"] == method]
-        if not runs or not runs[0]["points"]:
-            continue
-        steps = [point["steps"] for point in runs[0]["points"]]
-        lines = np.array([[value(point["actor"]) for point in run["points"]] for run in runs], dtype=float)
-        axes.plot(steps, lines.mean(axis=0), label=method, markersize=4, linewidth=1.4, **look)
-        axes.fill_between(steps, lines.min(axis=0), lines.max(axis=0), color=look["color"], alpha=0.12, linewidth=0)
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.grid(alpha=0.3)
+        steps, means, lines = _means(records, method, value)
+        if steps:
+            draw_seeds(panel, np.array(steps), lines, look["color"])
+            draw_line(panel, np.array(steps), means, method, look)

@@ -1,4 +1,4 @@
-"""What all figures share: panels, legends, lines with markers, and pictures as PNG."""
+"""What all figures share: panels, legends, lines with markers, seeds, labels, and pictures as PNG."""
 
 import functools
 import io
@@ -8,14 +8,16 @@ from typing import Any, TypeVar
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-PANEL = (3.6, 2.9)
-# Letters that can be read when the picture is half a page wide
+# Three panels beside each other are 7.5 inches wide, so that these letters can still be read on half a page's width
+PANEL = (2.5, 2.2)
 LOOK: dict[Any, Any] = {
     "font.size": 12.0,
     "axes.titlesize": 12.0,
+    "axes.labelsize": 12.0,
     "legend.fontsize": 11.5,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -52,7 +54,7 @@ def png(figure: Figure) -> bytes:
     :return: the picture, the same for the same figure, in the colours that it was drawn in
     """
     picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=110, pil_kwargs={"optimize": True})
+    figure.savefig(picture, format="png", dpi=120, pil_kwargs={"optimize": True})
     return picture.getvalue()
 
 
@@ -79,7 +81,7 @@ def panels(
         axes.grid(alpha=0.3)
         axes.tick_params(labelleft=not share or place % columns == 0)
         axes.xaxis.set_major_locator(MaxNLocator(4))
-        axes.yaxis.set_major_locator(MaxNLocator(6))
+        axes.yaxis.set_major_locator(MaxNLocator(5))
     return figure, list(grid[:number])
 
 
@@ -93,7 +95,7 @@ def legend(figure: Figure, panel: Sequence[Axes], title: str | None = None) -> N
     """
     entries = {label: handle for axes in panel for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     # Inches, at the size of letters above
-    widest = 0.95 + 0.105 * max(map(len, entries), default=0)
+    widest = 0.8 + 0.1 * max(map(len, entries), default=0)
     columns = max(min(len(entries), int(figure.get_figwidth() / widest)), 1)
     look: dict[str, Any] = dict(loc="outside upper center", ncols=columns, frameon=False, handlelength=2.6, columnspacing=1.4)
     figure.legend(list(entries.values()), list(entries), title=title, **look)
@@ -114,11 +116,72 @@ def draw_line(panel: Axes, x: np.ndarray, y: np.ndarray, label: str, look: dict[
     panel.plot(x, y, label=label, **look, drawstyle=drawstyle, markevery=every, markersize=5, linewidth=1.8)
 
 
-def label_steps(panel: Axes) -> None:
+def draw_seeds(panel: Axes, x: np.ndarray, lines: np.ndarray, color: Any) -> None:
+    """
+    Draw a thin line for each run.
+
+    :param panel: the panel
+    :param x: abscissae (E)
+    :param lines: ordinates of the runs (N, E)
+    :param color: the colour of the runs' method
+    """
+    panel.plot(x, lines.T, color=color, label="_seed", **SEED)
+
+
+def label_ends(panel: Axes, ends: dict[str, tuple[float, Any]]) -> None:
+    """
+    Write the name of each line beside its right end, names that would overlap a little apart.
+
+    :param panel: the panel, with its final limits
+    :param ends: the last ordinate and the colour of each line, by its name
+    """
+    low, high = panel.get_ylim()
+    figure = panel.get_figure(root=True)
+    assert figure is not None
+    height = panel.get_position().height * figure.get_figheight()
+    gap = (high - low) * 1.25 * LOOK["font.size"] / 72 / height
+    names = sorted(ends, key=lambda name: ends[name][0])
+    places: list[float] = []
+    for name in names:
+        wanted = min(max(ends[name][0], low), high)
+        places.append(max(wanted, places[-1] + gap) if places else wanted)
+    excess = max(0.0, places[-1] - high) if places else 0.0
+    for number in range(len(places) - 1, -1, -1):
+        places[number] -= excess
+        if number > 0:
+            excess = max(0.0, places[number - 1] + gap - places[number])
+    right = panel.get_xlim()[1]
+    for name, place in zip(names, places, strict=True):
+        # The colours of lines are too light for letters
+        color = tuple(0.7 * part for part in to_rgb(ends[name][1]))
+        look: dict[str, Any] = dict(textcoords="offset points", va="center", annotation_clip=False, color=color)
+        panel.annotate(name, (right, place), (5, 0), **look)
+
+
+def label_below(panel: Sequence[Axes], text: str) -> None:
+    """
+    Label the horizontal axis, which is the same in all panels, once, and begin it at 0.
+
+    :param panel: all panels of the figure
+    :param text: the label
+    """
+    right = max(axes.get_xlim()[1] for axes in panel)
+    for axes in panel:
+        axes.set_xlim(0, right)
+    if len(panel) == 1:
+        panel[0].set_xlabel(text)
+    else:
+        figure = panel[0].get_figure(root=True)
+        assert figure is not None
+        figure.supxlabel(text, fontsize=LOOK["axes.labelsize"])
+
+
+def count_steps(panel: Sequence[Axes]) -> None:
     """
     Label the horizontal axis with environment steps.
 
-    :param panel: the panel
+    :param panel: all panels of the figure
     """
-    panel.set_xlabel("environment steps")
-    panel.xaxis.set_major_formatter(EngFormatter(sep=""))
+    label_below(panel, "environment steps")
+    for axes in panel:
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))

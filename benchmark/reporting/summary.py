@@ -1,0 +1,95 @@
+"""The figure of a README: learning curves on one task, beside the stability of one sweep over hyperparameters."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import EngFormatter
+
+from benchmark.common.canvas import BAND, draw_line, draw_seeds, legend, panels, png, styled
+from benchmark.common.style import styles
+from benchmark.reporting.drawing import differing_range
+from benchmark.reporting.estimates import REPETITIONS, bootstrap, cells_of, interquartile_mean, share_reaching
+from benchmark.reporting.learning_curves import first_training_step, learnt_range
+from benchmark.reporting.scores import Study, curves, evaluation_grid, floors, score_table
+
+# Those of them that a study ran are drawn
+METHODS = ("CGP-Online", "CGP-Light", "TD3", "SAC")
+
+
+@styled
+def summary(learning: Study, sweep: Study, repetitions: int = REPETITIONS) -> bytes:
+    """
+    Draw the learning curves of a study's first task, and the stability curves of a sweep's.
+
+    :param learning: a study without axes
+    :param sweep: a study with axes
+    :param repetitions: number of bootstrap samples
+    :return: the picture, as PNG
+    :raises ValueError: if a study is not of its kind, or has none of the methods
+    """
+    if learning.axes or not sweep.axes:
+        raise ValueError(f"{learning.name} must be a study of learning curves, and {sweep.name} one of hyperparameters")
+    figure, (left, right) = panels(2, share=False, columns=2, size=(3.7, 2.5))
+    _draw_learning(left, learning, repetitions)
+    _draw_stability(right, sweep, repetitions)
+    legend(figure, [left, right])
+    return png(figure)
+
+
+def methods_of(study: Study, task: str) -> Sequence[str]:
+    """
+    Return the methods that are drawn.
+
+    :param study: the study
+    :param task: its task
+    :return: the methods
+    :raises ValueError: if no run of any has ended
+    """
+    ran = {record.method for record in study.records if record.task == task}
+    methods = [method for method in METHODS if method in ran]
+    if not methods:
+        raise ValueError(f"{study.name} has no run of {', '.join(METHODS)}")
+    return methods
+
+
+def _draw_learning(panel: Axes, study: Study, repetitions: int) -> None:
+    task = next(iter(study.tasks), "")
+    floor, grid = floors(study.records).get(task, 0.0), evaluation_grid(study.records, task)
+    trained = []
+    for method, look in styles(methods_of(study, task)).items():
+        runs = [record for record in study.records if (record.task, record.method) == (task, method)]
+        lines = curves(runs, floor, grid)
+        middle, interval = bootstrap(interquartile_mean, [[lines]], repetitions)
+        draw_seeds(panel, grid, lines, look["color"])
+        planned = len(study.facts["seeds"])
+        draw_line(panel, grid, middle, method if len(runs) >= planned else f"{method}, {len(runs)} of {planned} seeds", look)
+        if interval is not None:
+            panel.fill_between(grid, *interval, color=look["color"], **BAND)
+        trained.append(lines[:, grid > first_training_step(study)].ravel())
+    panel.set(title=task, xlabel="environment steps", ylabel="return", xlim=(0, grid[-1]))
+    panel.set_ylim(learnt_range(np.concatenate(trained)))
+    panel.xaxis.set_major_formatter(EngFormatter(sep=""))
+    panel.yaxis.set_major_formatter(EngFormatter(sep=""))
+
+
+def _draw_stability(panel: Axes, study: Study, repetitions: int) -> None:
+    task = next(iter(study.tasks), "")
+    methods = methods_of(study, task)
+    table = score_table([study])
+    runs = table[(table["task"] == task) & table["method"].isin(methods)]
+    levels, shares = np.unique(runs["score"]), []
+    for method, look in styles(methods).items():
+        cells = cells_of(runs[runs["method"] == method], "score")
+        share, band = bootstrap(lambda scores: share_reaching(scores, levels), [cells], repetitions)
+        shares.append(share)
+        draw_line(panel, levels, 100 * share, method, look, drawstyle="steps-pre")
+        if band is not None:
+            panel.fill_between(levels, 100 * band[0], 100 * band[1], step="pre", color=look["color"], **BAND)
+    panel.set(title=f"{task}, {_configurations(study)}", xlabel="final reward", ylabel="runs that reach it, %", ylim=(-3, 103))
+    panel.set_xlim(differing_range(levels, np.array(shares)))
+
+
+def _configurations(study: Study) -> str:
+    number = len({tuple(sorted(record.settings.items())) for record in study.records})
+    return f"{number} settings"
