@@ -16,6 +16,7 @@ from sb3_cgp.hparams import HParamsCallback
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
 from sb3_cgp.zoo.checkpoints import prepare_checkpoints
 from sb3_cgp.zoo.folders import ALGO, hyperparams_folder, state_folder
+from sb3_cgp.zoo.model_card import complete_model_cards
 from sb3_cgp.zoo.run_folders import hold_run, how_to_continue, release_run
 from sb3_cgp.zoo.search_space import convert_cgp_params, sample_cgp_params
 
@@ -38,6 +39,7 @@ def register_algorithm() -> None:
 
     ALGOS[ALGO] = CGP
     restore_generate_metadata()
+    complete_model_cards()
 
 
 def restore_generate_metadata() -> None:
