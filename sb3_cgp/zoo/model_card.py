@@ -74,8 +74,8 @@ def complete_model_cards() -> None:
     """
     Have the model cards of CGP completed when rl_zoo3 saves them. A repetition has no effect.
 
-    ``rl_zoo3.push_to_hub`` runs as Python's main module, whose functions cannot be replaced before they run. It saves a card by
-    a call of huggingface_hub's ``metadata_save``, which is replaced here.
+    ``rl_zoo3.push_to_hub`` runs as Python's main module, whose functions cannot be replaced before they run. It saves a card
+    by a call of huggingface_hub's ``metadata_save``, which is replaced here.
     """
     from huggingface_hub import repocard
 
