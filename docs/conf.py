@@ -22,7 +22,7 @@ myst_heading_anchors = 3
 # The notebooks are executed at every build. They write files, into a temporary folder.
 nb_execution_mode = "force"
 nb_execution_in_temp = True
-nb_execution_timeout = 600
+nb_execution_timeout = -1
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 
