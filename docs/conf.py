@@ -16,10 +16,17 @@ root_doc = "docs/index"
 include_patterns = ["README.md", "CHANGELOG.md", "docs/**", "benchmark/results/**"]
 exclude_patterns = [".*", "build", "dist", "logs", "venv"]
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton", "site_curves", "site_diagrams"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx_copybutton", "site_curves", "site_diagrams"]
 myst_enable_extensions = ["deflist"]
 # Links to headings, as GitHub has them
 myst_heading_anchors = 3
+
+# The notebooks are executed at every build. They write files, into a temporary folder.
+nb_execution_mode = "force"
+nb_execution_in_temp = True
+nb_execution_timeout = -1
+nb_execution_raise_on_error = True
+nb_merge_streams = True
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"

@@ -18,12 +18,11 @@ def python_examples(page: str) -> list[str]:
     return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
 
 
-def run_in_order(page: str, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+def shortened(monkeypatch: pytest.MonkeyPatch) -> None:
     """
-    Run all Python blocks of a page one after another in a folder, each as a script of its own.
+    Shorten trainings to a few steps, of which some are gradient steps, and offline training to a few rounds.
 
-    Trainings take few steps, of which some are gradient steps, and evaluations one episode. What is shortened are the numbers
-    alone: arguments are checked as they are.
+    What is shortened are the numbers alone: arguments are checked as they are.
     """
     learn, construct = CGP.learn, CGP.__init__
 
@@ -37,6 +36,11 @@ def run_in_order(page: str, monkeypatch: pytest.MonkeyPatch, folder: Path) -> No
     monkeypatch.setattr(CGP, "__init__", construct_short)
     monkeypatch.setattr(CGP, "learn", learn_short)
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 2)
+
+
+def run_in_order(page: str, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    """Run all Python blocks of a page one after another in a folder, each as a script of its own, with shortened trainings."""
+    shortened(monkeypatch)
     monkeypatch.chdir(folder)
     for example in python_examples(page):
         exec(compile(example, page, "exec"), {"__name__": "__main__"})

@@ -12,9 +12,11 @@ from typing import Any
 
 from sb3_cgp import CGP
 from sb3_cgp.common.extras import import_from_extra
+from sb3_cgp.hparams import HParamsCallback
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
 from sb3_cgp.zoo.checkpoints import prepare_checkpoints
 from sb3_cgp.zoo.folders import ALGO, hyperparams_folder, state_folder
+from sb3_cgp.zoo.model_card import complete_model_cards
 from sb3_cgp.zoo.run_folders import hold_run, how_to_continue, release_run
 from sb3_cgp.zoo.search_space import convert_cgp_params, sample_cgp_params
 
@@ -37,6 +39,7 @@ def register_algorithm() -> None:
 
     ALGOS[ALGO] = CGP
     restore_generate_metadata()
+    complete_model_cards()
 
 
 def restore_generate_metadata() -> None:
@@ -67,7 +70,8 @@ def register_search_space() -> None:
 
 def register_default_config() -> None:
     """
-    Make our ``cgp.yml`` the default of ``--conf-file``, and the run's folder the folder of its training states.
+    Make our ``cgp.yml`` the default of ``--conf-file``, and the run's folder the folder of its training states, and fill
+    TensorBoard's tab HParams.
 
     rl_zoo3 looks for default hyperparameters inside its own package only.
     """
@@ -96,6 +100,9 @@ def register_default_config() -> None:
         if not self.optimize_hyperparameters:
             prepare_checkpoints(self)
         create_callbacks(self)
+        has_own = any(isinstance(each, HParamsCallback) for each in self.callbacks)
+        if self.algo == ALGO and self.tensorboard_log and not has_own:
+            self.callbacks.append(HParamsCallback())
         # After an error, rl_zoo3 ends the first callback, which it takes for the progress bar
         self.callbacks.sort(key=lambda callback: isinstance(callback, TrainingCheckpointCallback))
 
