@@ -92,6 +92,22 @@ class Group:
     folder: Path
     runs: list[Run]
 
+    @classmethod
+    def of(cls, folder: Path, runs: Sequence[Run]) -> "Group":
+        """
+        Make the group of runs.
+
+        :param folder: the folder of the study's runs
+        :param runs: the runs
+        :return: the group, whose folder is that of all groups of the same runs in the same order
+        """
+        return cls(folder / FOLDER / hashlib.sha256(_as_json(runs)).hexdigest()[:16], list(runs))
+
+    def write(self) -> None:
+        """Write the runs to the group's folder, for the process that goes on with it."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(self.folder / RUNS, _as_json(self.runs))
+
     @property
     def states(self) -> Path:
         """The folder of the population's training states."""
@@ -101,21 +117,6 @@ class Group:
     def mark(self) -> dict[str, Any]:
         """The attribute of the runs' trials."""
         return {"name": self.folder.name, "agents": len(self.runs)}
-
-
-def make_group(folder: Path, runs: Sequence[Run]) -> Group:
-    """
-    Make the group of runs, and write it to its folder.
-
-    :param folder: the folder of the study's runs
-    :param runs: the runs
-    :return: the group, whose name is that of all groups of the same runs in the same order
-    """
-    content = json.dumps([asdict(run) for run in runs]).encode()
-    group = Group(folder / FOLDER / hashlib.sha256(content).hexdigest()[:16], list(runs))
-    group.folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(group.folder / RUNS, content)
-    return group
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,7 @@ class Groups:
             rest = [] if first is None else [ledger.claim(worker, [trial], attributes) for trial in plan.trials[1:]]
             claims, group = [claim for claim in (first, *rest) if claim is not None], plan.group
             if group is None and len(claims) > 1:
-                group = make_group(self._folder, [claim.run for claim in claims])
+                group = Group.of(self._folder, [claim.run for claim in claims])
                 claims = [claim for claim in claims if _annotate(ledger, claim, group)]
             if claims:
                 return claims, group
@@ -213,6 +214,10 @@ class Groups:
         return any(outcome.startswith(DISSOLVED) for outcome in outcomes) or has_state(
             run, run_folder(self._logs, self._study, run)
         )
+
+
+def _as_json(runs: Sequence[Run]) -> bytes:
+    return json.dumps([asdict(run) for run in runs]).encode()
 
 
 def _run(trial: FrozenTrial) -> Run:

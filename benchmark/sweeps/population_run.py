@@ -40,6 +40,7 @@ def train_group(
         for all runs of a task
     :raises FileExistsError: if a folder holds a run on another environment
     """
+    group.write()
     for run, folder in zip(group.runs, folders, strict=True):
         register_all(run)
         begin(run, folder)
@@ -57,10 +58,11 @@ def train_group(
         eval_freq=first.evaluation_interval,
         verbose=0,
     )
+    # The reporter is the last one: where no step is left, the callback before it restores the evaluations
     reporter = PopulationReporter(group.runs, folders, evaluation, claimed, watch)
     saving = TrainingCheckpointCallback(len(group.runs) * first.checkpoint_interval, group.states, keep=1)
     try:
-        population.learn(len(group.runs) * first.steps, callback=[evaluation, reporter, saving])
+        population.learn(len(group.runs) * first.steps, callback=[evaluation, saving, reporter])
         # Those of offline training, too
         reporter.report_failures()
         return _finish(group, experiments, population, evaluation.eval_env, claimed)

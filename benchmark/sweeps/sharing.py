@@ -51,7 +51,9 @@ def common_settings(run: Run) -> str | None:
     :param run: the run
     :return: a text that is the same for all of these runs, and for no others; None for a run that is trained alone
     """
-    hyperparams = {**(tuned_entry(run.algo, run.task) if run.tuned else {}), **run.hyperparams}
+    # The callback of an entry, which saves states, is replaced
+    entry = tuned_entry(run.algo, run.task) if run.tuned else {}
+    hyperparams = {name: value for name, value in entry.items() if name != "callback"} | run.hyperparams
     if run.algo not in AS_CGP or not hyperparams.keys() <= {*OWN, *COMMON, *ZOO}:
         return None
     frequency = hyperparams.get("train_freq", 1)
