@@ -1,6 +1,5 @@
 """Which runs of a study a process trains together: the rules, and what becomes of a group whose processes die."""
 
-import random
 from collections import Counter
 
 import pytest
@@ -98,7 +97,8 @@ NOISE = dict(noise_type="normal", noise_std=0.1)
     ("a", "b", "may_share"),
     [
         ({}, {}, True),
-        (dict(learning_rate=0.01, gamma=0.9, tau=0.1, policy_delay=2), dict(learning_rate="lin_0.001", target_noise_clip=0.1), True),
+        (dict(learning_rate=0.01, gamma=0.9, tau=0.1), dict(learning_rate="lin_0.001", target_noise_clip=0.1), True),
+        (dict(policy_delay=2), dict(policy_delay=3, target_update_interval=1), True),
         (dict(learning_starts=10), dict(learning_starts=100), True),
         (NOISE, NOISE | dict(noise_std=0.3), True),
         (NOISE, {}, False),

@@ -1,4 +1,4 @@
-"""Runs of a sweep that are trained as one population: each is recorded as if it were trained alone, and goes on after a kill."""
+"""Runs of a sweep that are trained as one population: each has its own record and folder, and continues after a kill."""
 
 import json
 import os
@@ -124,6 +124,13 @@ def test_a_population_of_one_run_is_the_run_alone(tmp_path, runs_of, algo, own):
     models = [ALGOS[algo].load(run_in(each).model_path) for each in (tmp_path / "alone", folder)]
     for name in ("num_timesteps", "_n_updates", "learning_starts", "batch_size", "buffer_size", "policy_delay", "seed"):
         assert len({getattr(model, name) for model in models}) == 1, name
+    for name in ("actor", "critic"):
+        one, other = (getattr(model, name).optimizer.state_dict() for model in models)
+        assert str(one["param_groups"]) == str(other["param_groups"])
+        assert one["state"].keys() == other["state"].keys() != set()
+        for key, moments in one["state"].items():
+            assert moments["step"] == other["state"][key]["step"]
+            np.testing.assert_allclose(other["state"][key]["exp_avg"], moments["exp_avg"], atol=1e-2)
     files = [{path.relative_to(each) for path in each.rglob("*")} for each in (tmp_path / "alone", folder)]
     # States are removed with the population's; no best model is kept
     assert {str(path).partition("/")[0] for path in files[0] - files[1]} <= {"best_model.zip", "state", ".run-lock"}
@@ -157,7 +164,7 @@ def test_an_interrupted_population_is_an_undisturbed_one(tmp_path, runs_of, meth
         assert rows(stopped) == rows(straight)
         assert len(rows(straight)) == 2
         assert list(read_curve(stopped).mean) == [taken.reports[run.key, step] for step in range(40, 241, 40)]
-    assert len({value for value in finals.values()}) == 4
+    assert len(set(finals.values())) == 4
 
 
 def test_a_population_that_was_interrupted_after_its_last_step_has_its_whole_curve(tmp_path, runs_of, monkeypatch):
@@ -165,8 +172,8 @@ def test_a_population_that_was_interrupted_after_its_last_step_has_its_whole_cur
     finals, taken, _ = train_together(runs, tmp_path / "straight")
     with monkeypatch.context() as patch:
         patch.setattr(population_run, "_finish", lambda *args: interrupt_at(0)(0))
+        group, folders = Group.of(tmp_path / "stopped", runs), [tmp_path / run.key for run in runs]
         with pytest.raises(Interruption):
-            group, folders = Group.of(tmp_path / "stopped", runs), [tmp_path / run.key for run in runs]
             train_group(group, folders, Taken(), lambda step: None, "cpu")
     continued = Taken()
     assert train_group(group, folders, continued, lambda step: None, "cpu") == finals
@@ -238,7 +245,7 @@ def test_a_sweep_by_populations_has_the_runs_and_the_page_of_one_without(tmp_pat
         execute_runs(ledger, folder / "logs", "a process", device="cpu", population=size)
         exported = export_study("tiny", url, folder / "results")
         page = figures([exported], folder / "results")
-        found[size] = ledger.records(), headings(page), [json.loads(line) for line in open(exported / "runs.jsonl")]
+        found[size] = ledger.records(), headings(page), [*map(json.loads, (exported / "runs.jsonl").read_text().splitlines())]
     (alone, headings_alone, lines_alone), (together, headings_together, lines_together) = found[1], found[8]
     assert headings_together == headings_alone
     assert {record.key for record in together} == {record.key for record in alone} == {run.key for run in sweep.runs()}

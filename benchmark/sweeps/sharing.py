@@ -80,7 +80,7 @@ def agent_arguments(algo: str, hyperparams: dict[str, Any]) -> Arguments:
         return given
     own = AS_CGP[algo]
     arguments = _defaults(algo) | given | {name: value for name, value in own.items() if name != "policy_kwargs"}
-    policy_kwargs = {"net_arch": SB3_NET_ARCH} | (hyperparams.get("policy_kwargs") or {}) | own["policy_kwargs"]
+    policy_kwargs = {"net_arch": SB3_NET_ARCH} | own["policy_kwargs"] | (hyperparams.get("policy_kwargs") or {})
     return arguments | {"policy_kwargs": policy_kwargs, "target_update_interval": arguments["policy_delay"]}
 
 
@@ -109,7 +109,12 @@ def ordinary_model(run: Run, hyperparams: dict[str, Any], agent: CGP) -> BaseAlg
     buffer_size, model.buffer_size = model.buffer_size, 1
     model._setup_model()
     model.buffer_size = buffer_size
-    model.set_parameters(agent.get_parameters(), device=agent.device)
+    parameters, own = agent.get_parameters(), model.get_parameters()
+    for name in ("actor.optimizer", "critic.optimizer"):
+        # CGP's optimizers are fused, or capturable by CUDA graphs; SB3's count their steps on the host
+        state = {key: moments | {"step": moments["step"].cpu()} for key, moments in parameters[name]["state"].items()}
+        parameters[name] = {"state": state, "param_groups": own[name]["param_groups"]}
+    model.set_parameters(parameters, device=agent.device)
     for name in ("num_timesteps", "_n_updates", "_current_progress_remaining"):
         setattr(model, name, getattr(agent, name))
     return model
