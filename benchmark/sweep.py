@@ -15,6 +15,7 @@ from benchmark.reporting.figures import FOLDER, figures, study_folders
 from benchmark.sweeps.checks import check_values
 from benchmark.sweeps.execution import execute
 from benchmark.sweeps.experiments import Sweep, experiments_in_words, included_sweeps, load_sweep, study_name
+from benchmark.sweeps.groups import add_population
 from benchmark.sweeps.processes import add_workers, check_grace, share_of_cores, terminate
 from benchmark.sweeps.storages import STORAGE_ERRORS, open_storage, reason_of
 from benchmark.sweeps.validation import SweepError
@@ -62,6 +63,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--eval-episodes", type=count, help="episodes of each evaluation, in place of the file's")
     parser.add_argument("--study", help="the study's name (default: the sweep's, with the tasks if they were replaced)")
     add_workers(parser, "logs/sweeps")
+    add_population(parser)
     parser.add_argument(
         "--results",
         type=output_folder,

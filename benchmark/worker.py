@@ -14,6 +14,7 @@ from pathlib import Path
 import torch as th
 
 from benchmark.common.arguments import add_epilog, count
+from benchmark.sweeps.groups import add_population, population_size
 from benchmark.sweeps.processes import add_heartbeats, check_grace, install_signal_handlers
 from benchmark.sweeps.storages import open_storage, patiently
 from benchmark.sweeps.studies import Ledger
@@ -33,6 +34,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--logs", type=Path, required=True, help="the folder of all sweeps' runs")
     parser.add_argument("--threads", type=count, default=1, help="PyTorch's threads (default: %(default)s)")
     parser.add_argument("--device", default="auto", help="device of the networks (default: %(default)s)")
+    add_population(parser)
     add_heartbeats(parser)
     parser.add_argument("--parent", type=int, help="the process whose end is this one's, too")
     add_epilog(
@@ -55,7 +57,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     install_signal_handlers(args.parent)
     th.set_num_threads(args.threads)
     ledger = Ledger(patiently(open_storage, args.storage), args.study, args.grace)
-    execute_runs(ledger, args.logs, f"{socket.gethostname()}:{os.getpid()}", args.beat, args.parent, args.device)
+    size = population_size(args.population, args.device)
+    execute_runs(ledger, args.logs, f"{socket.gethostname()}:{os.getpid()}", args.beat, args.parent, args.device, size)
 
 
 if __name__ == "__main__":

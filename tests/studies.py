@@ -16,6 +16,7 @@ from benchmark.sweeps.runs import Run
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import ERROR, KEY, owned
 from benchmark.sweeps.sweep_files import Method, SweepFile
+from sb3_cgp.resumption.store import StateStore
 
 GRACE = 60.0
 
@@ -36,6 +37,22 @@ def pretend_to_train(run, folder, report, watch, device):
     if run.method == "Bad":
         raise FloatingPointError("not a number")
     return 100.0 * run.seed
+
+
+def pretend_to_train_group(group, folders, claimed, watch, device):
+    """Give what a group's training gives, and save a state on the way."""
+    assert len(folders) == len(group.runs) > 1
+    group.write()
+    StateStore(group.states, keep=1).save(1, {})
+    finals = {}
+    for index, run in enumerate(group.runs):
+        try:
+            finals[index] = pretend_to_train(
+                run, folders[index], lambda *point, run=run: claimed.report(run, *point), watch, ""
+            )
+        except FloatingPointError as error:
+            claimed.fail(run, error)
+    return finals
 
 
 class Clock:
@@ -72,6 +89,7 @@ class Heart:
 def pretend(monkeypatch, clock):
     """Let workers train nothing, and wait for nothing."""
     monkeypatch.setattr(worker, "train", pretend_to_train)
+    monkeypatch.setattr(worker, "train_group", pretend_to_train_group)
     monkeypatch.setattr(worker, "HeartbeatThread", Heart)
     monkeypatch.setattr(worker, "FileLock", lambda path: nullcontext())
     times = SimpleNamespace(sleep=clock.sleep, monotonic=clock, strftime=time.strftime)
@@ -109,14 +127,14 @@ class Line:
         return call
 
 
-def work_through(storage, sweep, clock, logs):
+def work_through(storage, sweep, clock, logs, population=1):
     """Do what a process of a sweep does."""
     ledger = Ledger(storage, "study", GRACE, clock)
     ledger.open(sweep, {"experiment": sweep.name})
-    worker.execute_runs(ledger, logs, "a process")
+    worker.execute_runs(ledger, logs, "a process", population=population)
 
 
-def mortal(storage, sweep, clock, logs, calls, takes_effect):
+def mortal(storage, sweep, clock, logs, calls, takes_effect, population=1):
     """
     Do the same in a process that dies at a call.
 
@@ -125,7 +143,7 @@ def mortal(storage, sweep, clock, logs, calls, takes_effect):
     left = iter([None] * calls)
     line = Line(storage, lambda: next(left, (Killed, takes_effect)))
     try:
-        work_through(line, sweep, clock, logs)
+        work_through(line, sweep, clock, logs, population)
     except Killed:
         return True
     return False
@@ -138,11 +156,12 @@ class Crew:
     :param seed: of the draw
     :param storage: the storage that they share
     :param clock: their clock
+    :param population: the most runs that each of them trains together
     """
 
-    def __init__(self, seed, storage, clock):
+    def __init__(self, seed, storage, clock, population=1):
         self.draw = random.Random(seed)
-        self.storage, self.clock = storage, clock
+        self.storage, self.clock, self.population = storage, clock, population
 
     def work(self, sweep, logs, n_processes, n_deaths, n_steps):
         """Work a sweep off, with new processes for those that die."""
@@ -181,7 +200,8 @@ class _Member:
         self.next_fault = None
         self.is_alive, self.error = True, None
         self._go, self._is_ready = threading.Semaphore(0), threading.Semaphore(0)
-        self._thread = threading.Thread(target=self._run, args=(Line(crew.storage, self._fault), sweep, crew.clock, logs))
+        line = Line(crew.storage, self._fault)
+        self._thread = threading.Thread(target=self._run, args=(line, sweep, crew.clock, logs, crew.population))
         self._thread.start()
         self._is_ready.acquire()
 
@@ -199,9 +219,9 @@ class _Member:
         fault, self.next_fault = self.next_fault, None
         return fault
 
-    def _run(self, line, sweep, clock, logs):
+    def _run(self, *args):
         try:
-            work_through(line, sweep, clock, logs)
+            work_through(*args)
         except Killed:
             pass
         except BaseException as error:

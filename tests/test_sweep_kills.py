@@ -82,6 +82,9 @@ class Study:
     :param sweep: the sweep's file
     """
 
+    # Further options of the workers
+    options = ()
+
     def __init__(self, folder, url, name, sweep):
         self.folder, self.url, self.name, self.sweep = folder, url, name, sweep
         self.workers = set()
@@ -95,7 +98,7 @@ class Study:
         sys.stdout = sys.stderr = open(self.folder / "workers.log", "a")  # noqa: SIM115
         command = ["--study", self.name, "--storage", self.url, "--logs", str(self.folder / "logs"), "--device", "cpu"]
         worker_loop.PAUSE = 0.2
-        worker.main([*command, "--beat", str(BEAT), "--grace", str(GRACE)])
+        worker.main([*command, *self.options, "--beat", str(BEAT), "--grace", str(GRACE)])
 
     def man(self, n_workers):
         """

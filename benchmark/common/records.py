@@ -56,7 +56,9 @@ class Record:
     :param final: mean return of the final model over ``FINAL_EPISODES`` episodes; None for a run that failed
     :param error: the error of a failed run; None for other runs
     :param seconds: wall-clock time of all attempts together
-    :param processor_seconds: time on the processor of all attempts and threads together; None where it was not measured
+    :param processor_seconds: time on the processor of all attempts and threads together; None where it was not measured.
+        Of a run in a population, the process's time divided by the number of agents
+    :param population: number of agents that were trained in one process with it, itself included; 1 for a run alone
     """
 
     experiment: str
@@ -71,6 +73,7 @@ class Record:
     error: str | None
     seconds: float | None
     processor_seconds: float | None = None
+    population: int = 1
 
     @property
     def key(self) -> str:

@@ -197,6 +197,8 @@ def minutes_caption(study: Study, task: str) -> str:
     machines = [command["machine"] for command in study.facts["commands"]]
     processors = dict.fromkeys(str(machine["gpu"] or machine["cpu"]) for machine in machines)
     sentences = [MINUTES.format(task)]
+    if any(record.task == task and record.population > 1 for record in study.records):
+        sentences.append("The time of runs that were trained as one population is the process's, divided by their number.")
     if left_out:
         sentences.append(f"Left out: {left_out} run{'s' * (left_out > 1)} without a recorded time.")
     if len(processors) > 1:

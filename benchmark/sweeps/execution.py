@@ -60,6 +60,7 @@ def worker_command(args: argparse.Namespace, study: str) -> list[str]:
     """
     command = [sys.executable, "-m", "benchmark.worker", "--study", study, "--storage", args.storage]
     command += ["--logs", str(args.logs), "--threads", str(args.threads), "--device", args.device]
+    command += ["--population", str(args.population)]
     return [*command, "--parent", str(os.getpid()), "--beat", str(args.beat), "--grace", str(args.grace)]
 
 

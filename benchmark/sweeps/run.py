@@ -1,17 +1,14 @@
 """One run of a sweep, trained by rl_zoo3 in a folder of its own, and continued from its last state if it has one."""
 
-import argparse
 import json
 import math
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch as th
-import yaml
 from gymnasium.error import DependencyNotInstalled
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import ALGOS
@@ -30,6 +27,7 @@ from benchmark.sweeps.random_actions import register_random_actions
 from benchmark.sweeps.reporter import Report, Reporter
 from benchmark.sweeps.runs import Run
 from benchmark.sweeps.storages import STORAGE_ERRORS
+from benchmark.sweeps.zoo_experiments import new_experiment, resumed_experiment
 from sb3_cgp.common.files import write_atomically
 from sb3_cgp.resumption.algorithm import resumable
 from sb3_cgp.resumption.store import NoStateLeftError, StateStore
@@ -69,10 +67,8 @@ def train(run: Run, folder: Path, report: Report, watch: Callable[[int], None], 
     :raises FloatingPointError: if the mean return is not finite
     :raises FileExistsError: if the folder holds a run on another environment
     """
-    register()
-    register_random_actions()
-    import_packages(run.gym_packages)
-    _begin(run, folder)
+    register_all(run)
+    begin(run, folder)
     try:
         manager, model = _set_up(run, folder, device)
     except NoStateLeftError as error:
@@ -89,6 +85,17 @@ def train(run: Run, folder: Path, report: Report, watch: Callable[[int], None], 
     return final
 
 
+def register_all(run: Run) -> None:
+    """
+    Register the algorithms and the environments that a run may need.
+
+    :param run: the run
+    """
+    register()
+    register_random_actions()
+    import_packages(run.gym_packages)
+
+
 def forget_states(folder: Path) -> None:
     """
     Remove the states that a run would continue from.
@@ -98,11 +105,36 @@ def forget_states(folder: Path) -> None:
     shutil.rmtree(state_folder(str(folder)), ignore_errors=True)
 
 
-def _begin(run: Run, folder: Path) -> None:
-    """Remove the states of another run, which a study of the same name has left there: this run does not continue them."""
-    settings = json.dumps(asdict(run)).encode()
+def has_state(run: Run, folder: Path) -> bool:
+    """
+    Return whether a run would continue from a state.
+
+    :param run: the run
+    :param folder: the run's folder
+    :return: whether the folder holds states, and they are the run's own
+    """
+    return _is_of(run, folder) and len(StateStore(state_folder(str(folder))).steps()) > 0
+
+
+def _is_of(run: Run, folder: Path) -> bool:
     path = folder / SETTINGS
-    if not path.is_file() or path.read_bytes() != settings:
+    return path.is_file() and path.read_bytes() == _settings(run)
+
+
+def _settings(run: Run) -> bytes:
+    return json.dumps(asdict(run)).encode()
+
+
+def begin(run: Run, folder: Path) -> None:
+    """
+    Make a folder a run's own: a run does not continue states that a study of the same name has left there.
+
+    :param run: the run
+    :param folder: the run's folder
+    :raises FileExistsError: if the folder holds a run on another environment
+    """
+    path = folder / SETTINGS
+    if not _is_of(run, folder):
         other = json.loads(path.read_bytes()) if path.is_file() else {}
         if other.get("task", run.task) != run.task:
             # rl_zoo3 gives both environments the same name
@@ -111,91 +143,22 @@ def _begin(run: Run, folder: Path) -> None:
                 "or another folder by --logs"
             )
         forget_states(folder)
-        write_atomically(path, settings)
+        write_atomically(path, _settings(run))
 
 
 def _set_up(run: Run, folder: Path, device: str) -> tuple[ExperimentManager, BaseAlgorithm]:
     set_random_seed(run.seed)
-    manager = _manager(run, folder, device)
+    ALGOS[run.algo] = _with_states(ALGOS[run.algo])
+    if StateStore(state_folder(str(folder))).steps():
+        manager: ExperimentManager = resumed_experiment(ResumedExperiment, run, folder, device)
+    else:
+        manager = new_experiment(ExperimentManager, run, folder, device)
     model, _ = manager.setup_experiment()  # type: ignore[misc]
     return manager, model
 
 
-def _manager(run: Run, folder: Path, device: str) -> ExperimentManager:
-    """Return rl_zoo3's manager of a run that starts or continues."""
-    ALGOS[run.algo] = _with_states(ALGOS[run.algo])
-    args = _arguments(run, folder, device)
-    if StateStore(state_folder(str(folder))).steps():
-        # With the hyperparameters of the algorithm's YAML file
-        (saved,) = folder.glob("*/config.yml")
-        return ResumedExperiment(folder, args, dict(yaml.load(saved.read_text(), Loader=yaml.UnsafeLoader)))
-    manager = ExperimentManager(
-        args,
-        run.algo,
-        run.task,
-        args.log_folder,
-        n_timesteps=run.steps,
-        eval_freq=run.evaluation_interval,
-        n_eval_episodes=run.evaluation_episodes,
-        log_interval=args.log_interval,
-        config=args.conf_file,
-        seed=run.seed,
-        verbose=0,
-        device=device,
-        hyperparams=_hyperparams(run) if run.tuned else None,
-    )
-    manager.save_path = str(folder)
-    manager.params_path = f"{folder}/{manager.env_name}"
-    return manager
-
-
 def _with_states(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
     return resumable(algorithm) if issubclass(algorithm, OffPolicyAlgorithm) else algorithm
-
-
-def _hyperparams(run: Run) -> dict[str, Any]:
-    """Return the hyperparameters with the callback that saves training states, if the algorithm has them."""
-    hyperparams: dict[str, Any] = {"n_timesteps": run.steps, **run.hyperparams}
-    if issubclass(ALGOS[run.algo], OffPolicyAlgorithm):
-        saving = {"sb3_cgp.resumption.callbacks.TrainingCheckpointCallback": {"save_freq": run.checkpoint_interval, "keep": 1}}
-        # rl_zoo3 takes one callback, or a list of them
-        own = run.hyperparams.get("callback") or []
-        hyperparams["callback"] = [*(own if isinstance(own, list) else [own]), saving]
-    return hyperparams
-
-
-def _arguments(run: Run, folder: Path, device: str) -> argparse.Namespace:
-    """Return the arguments of rl_zoo3.train for the run: rl_zoo3's other scripts and a resumption read them."""
-    conf_file = None
-    if not run.tuned:
-        conf_file = folder / "hyperparams.yml"
-        write_atomically(conf_file, yaml.safe_dump({run.task: _hyperparams(run)}).encode())
-    return argparse.Namespace(
-        algo=run.algo,
-        env=run.task,
-        seed=run.seed,
-        conf_file=None if conf_file is None else str(conf_file),
-        device=device,
-        env_kwargs={},
-        eval_env_kwargs=None,
-        eval_episodes=run.evaluation_episodes,
-        eval_freq=run.evaluation_interval,
-        gym_packages=run.gym_packages,
-        hyperparams=None,
-        # Of the whole configuration, as --folder takes it
-        log_folder=str(folder.parent.parent),
-        log_interval=-1,
-        n_eval_envs=1,
-        n_timesteps=run.steps,
-        num_threads=-1,
-        progress=False,
-        save_freq=-1,
-        save_replay_buffer=False,
-        tensorboard_log="",
-        trained_agent="",
-        vec_env="dummy",
-        verbose=0,
-    )
 
 
 def _final_return(model: BaseAlgorithm, evaluation: EvalCallback) -> float:

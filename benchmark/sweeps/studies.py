@@ -19,19 +19,19 @@ databases only, not with its proxy.
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 from optuna.distributions import BaseDistribution
-from optuna.exceptions import DuplicatedStudyError, UpdateFinishedTrialError
+from optuna.exceptions import DuplicatedStudyError
 from optuna.storages import BaseStorage
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from benchmark.common.records import Record
 from benchmark.sweeps.experiments import Sweep
-from benchmark.sweeps.heartbeats import PROGRESS, SilenceDetector, TrialLostError, send_beat
+from benchmark.sweeps.heartbeats import PROGRESS, SilenceDetector, TrialLostError
 from benchmark.sweeps.runs import Run
 from benchmark.sweeps.storages import patiently
 from benchmark.sweeps.study_trials import (
@@ -39,6 +39,7 @@ from benchmark.sweeps.study_trials import (
     ERROR,
     KEY,
     OUTCOME,
+    POPULATION,
     RUN,
     SWEEP,
     WORKER,
@@ -49,11 +50,11 @@ from benchmark.sweeps.study_trials import (
     params_of,
     with_seed,
 )
-from benchmark.sweeps.study_view import StudyView
+from benchmark.sweeps.trial_writer import TrialWriter
 from benchmark.sweeps.validation import SweepError
 
 
-class Ledger(StudyView):
+class Ledger(TrialWriter):
     """
     A study whose trials this process enqueues, claims and ends by the rules above.
 
@@ -169,12 +170,14 @@ class Ledger(StudyView):
                 continue
             spent = {"seconds": record.seconds, "processor_seconds": record.processor_seconds}
             progress = {PROGRESS: {"step": record.steps, **spent}, OUTCOME: "adopted"}
+            population = {} if record.population == 1 else {POPULATION: {"agents": record.population}}
+            error = {} if record.error is None else {ERROR: record.error}
             trial = create_trial(
                 state=TrialState.FAIL if record.final is None else TrialState.COMPLETE,
                 value=record.final,
                 params=params_of(run, self._distributions),
                 distributions=self._distributions,
-                user_attrs=attributes_of(run) | progress | ({} if record.error is None else {ERROR: record.error}),
+                user_attrs=attributes_of(run) | progress | population | error,
                 intermediate_values=dict(zip(record.timesteps, record.returns, strict=True)),
             )
             patiently(self.storage.create_new_trial, self.study_id, trial)
@@ -191,14 +194,18 @@ class Ledger(StudyView):
         trials = self.trials() if silent else trials
         self.enqueue_missing((Run(**trial.user_attrs[RUN]) for trial in trials), trials)
 
-    def claim(self, worker: str) -> Claim | None:
+    def claim(
+        self, worker: str, trials: Iterable[FrozenTrial] | None = None, attributes: Mapping[str, Any] | None = None
+    ) -> Claim | None:
         """
         Take a run that waits.
 
         :param worker: this process's name, for people
-        :return: the run; None if no run waits
+        :param trials: the trials to try, in their order; None for all of the study
+        :param attributes: further attributes of the trial, which are set before the worker's name
+        :return: the run; None if none of the trials waits any more
         """
-        for trial in self.trials():
+        for trial in self.trials() if trials is None else trials:
             if trial.state is not TrialState.WAITING:
                 continue
             trial_id = self._id(trial)
@@ -209,90 +216,21 @@ class Ledger(StudyView):
             if owner is None or owner.number != trial.number:
                 self._end(trial_id, TrialState.FAIL, outcome="given up: the run has another trial")
                 continue
+            claim = Claim(trial_id, Run(**trial.user_attrs[RUN]))
             try:
-                patiently(self.storage.set_trial_user_attr, trial_id, WORKER, worker)
-            except UpdateFinishedTrialError:
+                for name, value in {**(attributes or {}), WORKER: worker}.items():
+                    self.annotate(claim, name, value)
+            except TrialLostError:
                 continue
-            return Claim(trial_id, Run(**trial.user_attrs[RUN]))
+            return claim
         return None
 
-    def _take(self, trial_id: int) -> bool:
-        try:
-            return patiently(self.storage.set_trial_state_values, trial_id, TrialState.RUNNING)
-        except UpdateFinishedTrialError:
-            return False
-
-    def beat(self, claim: Claim, count: str, step: int, seconds: float, processor_seconds: float = 0.0) -> None:
-        """
-        Report that this process is alive, and the progress of the run.
-
-        :param claim: the run
-        :param count: a text that no earlier heartbeat had
-        :param step: environment steps so far
-        :param seconds: wall-clock time of this attempt so far
-        :param processor_seconds: its time on the processor, of all threads together
-        :raises TrialLostError: if another process has ended the trial
-        """
-        send_beat(self.storage, claim.trial_id, count, step, seconds, processor_seconds)
-
-    def report(self, claim: Claim, step: int, value: float) -> None:
-        """
-        Record an evaluation.
-
-        :param claim: the run
-        :param step: environment steps
-        :param value: mean return
-        :raises TrialLostError: if another process has ended the trial
-        """
-        try:
-            patiently(self.storage.set_trial_intermediate_value, claim.trial_id, step, value)
-        except UpdateFinishedTrialError as error:
-            raise TrialLostError(claim.run.key) from error
-
-    def complete(self, claim: Claim, value: float) -> None:
-        """
-        End a run.
-
-        :param claim: the run
-        :param value: mean return of the final model
-        :raises TrialLostError: if another process has ended the trial
-        """
-        self._end(claim.trial_id, TrialState.COMPLETE, value=value)
-        # This process may have ended it itself, before the answer of its database was lost
-        if patiently(self.storage.get_trial, claim.trial_id).state is not TrialState.COMPLETE:
-            raise TrialLostError(claim.run.key)
-
-    def fail(self, claim: Claim, error: BaseException) -> None:
-        """
-        End a run that failed for its own reasons.
-
-        :param claim: the run
-        :param error: the error
-        """
-        text = f"{type(error).__name__}: {error}"
-        try:
-            patiently(self.storage.set_trial_user_attr, claim.trial_id, ERROR, text)
-        except UpdateFinishedTrialError:
-            return
-        self._end(claim.trial_id, TrialState.FAIL)
-
-    def release(self, claim: Claim) -> None:
+    def release(self, claim: Claim, outcome: str = "given back: its process was stopped") -> None:
         """
         Give back a run that is not finished, to be continued by any process.
 
         :param claim: the run
+        :param outcome: the reason, for people
         """
-        self._end(claim.trial_id, TrialState.FAIL, outcome="given back: its process was stopped")
+        self._end(claim.trial_id, TrialState.FAIL, outcome=outcome)
         self.enqueue_missing([claim.run])
-
-    def _end(self, trial_id: int, state: TrialState, outcome: str | None = None, value: float | None = None) -> None:
-        try:
-            if outcome is not None:
-                patiently(self.storage.set_trial_user_attr, trial_id, OUTCOME, outcome)
-            patiently(self.storage.set_trial_state_values, trial_id, state, None if value is None else [value])
-        except UpdateFinishedTrialError:
-            # Another process has ended it, or this one before the answer of its database was lost
-            pass
-
-    def _id(self, trial: FrozenTrial) -> int:
-        return patiently(self.storage.get_trial_id_from_study_id_trial_number, self.study_id, trial.number)

@@ -16,6 +16,8 @@ from benchmark.sweeps.runs import Run
 SWEEP, COMMAND = "sweep", "command "
 # Attributes of a trial
 RUN, KEY, ERROR, WORKER, OUTCOME = "run", "key", "error", "worker", "outcome"
+# Of a run that is trained in a population: the number of its agents, and the name of the group of runs
+POPULATION = "population"
 # The seed is an attribute, for optuna-dashboard to show and sort by. As a parameter, it would take part in the importances of
 # parameters. Studies that earlier versions began have it as a parameter, too.
 SEED = "seed"
@@ -150,4 +152,5 @@ def record_of(experiment: str, trial: FrozenTrial, trials: Iterable[FrozenTrial]
         trial.user_attrs.get(ERROR),
         seconds_of(trials, "seconds"),
         seconds_of(trials, "processor_seconds"),
+        trial.user_attrs.get(POPULATION, {}).get("agents", 1),
     )

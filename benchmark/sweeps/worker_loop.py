@@ -1,14 +1,19 @@
-"""The work of one process: it claims a run of a study, trains it, and claims the next, until all have ended."""
+"""The work of one process: it claims runs of a study, trains them, and claims the next, until all have ended."""
 
-import functools
 import os
+import shutil
 import time
 import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from filelock import FileLock
 
+from benchmark.sweeps.claimed_runs import ClaimedRuns
+from benchmark.sweeps.groups import Group, Groups
 from benchmark.sweeps.heartbeats import BEAT, HeartbeatThread, TrialLostError
+from benchmark.sweeps.population_run import train_group
 from benchmark.sweeps.processes import PAUSE, TERMINATED
 from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, run_folder, train
 from benchmark.sweeps.studies import Ledger
@@ -16,7 +21,13 @@ from benchmark.sweeps.study_trials import Claim
 
 
 def execute_runs(
-    ledger: Ledger, logs: Path, name: str, beat: float = BEAT, parent: int | None = None, device: str = "auto"
+    ledger: Ledger,
+    logs: Path,
+    name: str,
+    beat: float = BEAT,
+    parent: int | None = None,
+    device: str = "auto",
+    population: int = 1,
 ) -> None:
     """
     Execute the runs of a study until all have ended.
@@ -27,13 +38,15 @@ def execute_runs(
     :param beat: seconds between two heartbeats
     :param parent: the process that started this one
     :param device: device of the networks
-    :raises SystemExit: if the process has to end; its run is given back, and any process continues it
+    :param population: the largest number of runs that are trained together
+    :raises SystemExit: if the process has to end; its runs are given back, and any process continues them
     """
+    groups = Groups(logs, ledger.name, population)
     while True:
         ledger.recover()
-        claim = ledger.claim(name)
-        if claim is not None:
-            _train_claimed(ledger, claim, logs, beat, parent, device)
+        claims, group = groups.claim(ledger, name)
+        if claims:
+            _train_claimed(ledger, claims, group, logs, beat, parent, device)
         elif not ledger.left():
             return
         else:
@@ -43,28 +56,66 @@ def execute_runs(
                 raise SystemExit(TERMINATED)
 
 
-def _train_claimed(ledger: Ledger, claim: Claim, logs: Path, beat: float, parent: int | None, device: str) -> None:
-    folder = run_folder(logs, ledger.name, claim.run)
-    folder.mkdir(parents=True, exist_ok=True)
-    print(f"{time.strftime('%H:%M:%S')} {claim.run.key}", flush=True)
+def _train_claimed(
+    ledger: Ledger, claims: Sequence[Claim], group: Group | None, logs: Path, beat: float, parent: int | None, device: str
+) -> None:
+    runs = [claims[0].run] if group is None else group.runs
+    folders = [run_folder(logs, ledger.name, run) for run in runs]
+    claimed = ClaimedRuns(ledger, claims, len(runs))
+    print(f"{time.strftime('%H:%M:%S')} {_in_words(claims, group)}", flush=True)
 
     def report(step: int, value: float) -> None:
-        ledger.report(claim, step, value)
+        claimed.report(runs[0], step, value)
 
     try:
-        # A process that was taken for lost may still write to the folder
-        with HeartbeatThread(functools.partial(ledger.beat, claim), beat, parent) as heartbeat, FileLock(folder / ".lock"):
-            final = train(claim.run, folder, report, heartbeat.watch, device)
-        ledger.complete(claim, final)
-        forget_states(folder)
+        with HeartbeatThread(claimed.beat, beat, parent) as heartbeat, _locked(folders):
+            if group is None:
+                finals = {0: train(runs[0], folders[0], report, heartbeat.watch, device)}
+            else:
+                finals = train_group(group, folders, claimed, heartbeat.watch, device)
+        lost = [runs[index].key for index, final in finals.items() if not claimed.complete(runs[index], final)]
+        for key in lost:
+            print(f"{key} was given to another process", flush=True)
+        # Another process continues a lost run from its last state
+        if not lost:
+            _forget(group, folders)
     except TrialLostError:
-        print(f"{claim.run.key} was given to another process", flush=True)
+        print(f"{_in_words(claims, group)} was given to another process", flush=True)
+        claimed.release()
     except MACHINE_ERRORS:
-        ledger.release(claim)
+        claimed.release()
         raise
     except Exception as error:
         traceback.print_exc()
-        ledger.fail(claim, error)
+        if group is None:
+            claimed.fail(runs[0], error)
+        else:
+            _forget(group, folders)
+            claimed.dissolve(error)
     except BaseException:
-        ledger.release(claim)
+        claimed.release()
         raise
+
+
+def _in_words(claims: Sequence[Claim], group: Group | None) -> str:
+    keys = ", ".join(claim.run.key for claim in claims)
+    return keys if group is None else f"population {group.folder.name} of {len(group.runs)}: {keys}"
+
+
+@contextmanager
+def _locked(folders: Sequence[Path]) -> Iterator[None]:
+    """Lock the folders of runs: a process that was taken for lost may still write to them."""
+    with ExitStack() as stack:
+        # All processes in the same order, so that no two wait for each other
+        for folder in sorted(folders):
+            folder.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(FileLock(folder / ".lock"))
+        yield
+
+
+def _forget(group: Group | None, folders: Sequence[Path]) -> None:
+    """Remove the states of runs that have ended."""
+    if group is None:
+        forget_states(folders[0])
+    else:
+        shutil.rmtree(group.folder, ignore_errors=True)

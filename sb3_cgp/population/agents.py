@@ -105,18 +105,26 @@ def make_agent(
     return agent
 
 
-def check_supported(policy: Any, arguments: Arguments, observation_space: spaces.Space) -> None:
+def check_observations(observation_space: spaces.Space) -> None:
     """
-    Refuse what an agent alone can do and a population cannot, before the agents are made.
+    Refuse observations that the networks of a population do not take.
+
+    :param observation_space: observation space
+    :raises ValueError: if it is no ``Box``
+    """
+    allowed = "a Box in a population, whose networks are MLPs: train agents with other observations one by one"
+    require(isinstance(observation_space, spaces.Box), "observation_space", observation_space, allowed)
+
+
+def check_supported(policy: Any, arguments: Arguments) -> None:
+    """
+    Refuse arguments that an agent alone takes and a population does not, before the agents are made.
 
     :param policy: the policy's class
     :param arguments: the first agent's arguments
-    :param observation_space: observation space
     :raises ValueError: naming the argument, its value, and what is allowed
     """
     require(policy in POLICIES, "policy", policy, "'MlpPolicy' in a population")
-    allowed = "a Box in a population, whose networks are MLPs: train agents with other observations one by one"
-    require(isinstance(observation_space, spaces.Box), "observation_space", observation_space, allowed)
     buffer_class = arguments.get("replay_buffer_class")
     allowed = "None in a population, which samples the columns of SB3's own buffers"
     require(buffer_class is None, "replay_buffer_class", buffer_class, allowed)

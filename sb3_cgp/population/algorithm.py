@@ -20,6 +20,7 @@ from sb3_cgp.population.agents import (
     OWN,
     Arguments,
     check_networks,
+    check_observations,
     check_supported,
     join_action_noise,
     make_agent,
@@ -93,7 +94,8 @@ class Population(ResumableAlgorithm, PopulationMembers):
     def _setup_model(self) -> None:
         n_agents = len(self)
         self._check_env()
-        check_supported(self.policy_class, self.agents[0], self.observation_space)
+        check_supported(self.policy_class, self.agents[0])
+        check_observations(self.observation_space)
         spaces = self.observation_space, self.action_space
         # On the CPU, where a CGP alone draws its first parameters too
         agents = [make_agent(self.policy_class, each, *spaces, "cpu") for each in self.agents]  # type: ignore[arg-type]

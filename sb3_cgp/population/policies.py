@@ -5,8 +5,8 @@ Shapes: N agents, B states per agent, F features, A action dimensions.
 """
 
 import copy
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import torch as th
@@ -17,6 +17,7 @@ from torch import nn
 
 from sb3_cgp.algorithm import CGP
 from sb3_cgp.common.rules import require
+from sb3_cgp.core.policies import CGPPolicy
 from sb3_cgp.population.adam import AgentAdam
 from sb3_cgp.population.networks import StackedMLP, agent_slices
 from sb3_cgp.selectors.proposals import takes_proposals
@@ -33,6 +34,8 @@ class PopulationPolicy(BasePolicy):
     :param agents: the agents, whose networks are copied
     """
 
+    # The core's method, which needs no more than the attribute `inference`
+    acting_by: Callable[..., AbstractContextManager[None]] = CGPPolicy.acting_by
     actor_optimizer: AgentAdam
     critic_optimizer: AgentAdam
     failed_at: th.Tensor
@@ -98,19 +101,6 @@ class PopulationPolicy(BasePolicy):
         n_rows, action_dim = features.shape[0] * features.shape[1], int(self.action_space.shape[0])
         selection = self.selector.select(critics.score(features), n_rows, action_dim, features.device, **arguments)
         return selection.actions.unflatten(0, features.shape[:2])
-
-    @contextmanager
-    def acting_by(self, inference: str) -> Iterator[None]:
-        """
-        Let ``predict`` use the "actor", the "averaged_actor" or "cem" (the selector) within a ``with`` block.
-
-        :param inference: one of them
-        """
-        usual, self.inference = self.inference, inference
-        try:
-            yield
-        finally:
-            self.inference = usual
 
     def set_training_mode(self, mode: bool) -> None:
         """

@@ -3,6 +3,7 @@
 import argparse
 import importlib
 from collections import OrderedDict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -105,25 +106,33 @@ class ResumedExperiment(ExperimentManager):
         assert model.resumption is not None
         if model.verbose < 1:
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
-        self._continue_monitors(env, model.num_timesteps, model.resumption["environment"])
-        return model
-
-    def _continue_monitors(self, env: VecEnv, timestep: int, state: Any) -> None:
-        """Remove the episodes that ended after the state was saved, because the training repeats them."""
         paths = [Path(self.save_path) / f"{index}.{Monitor.EXT}" for index in range(env.num_envs)]
-        n_episodes: list[int | None] = [None] * env.num_envs
-        if state is not None:
-            # For the number of episodes; `learn` restores the environment again, before its first step
-            restore_environment(env, state)
-            n_episodes = [len(lengths) for lengths in env.get_attr("episode_lengths")]
-        for index, path in enumerate(paths):
-            cut_monitors(path, n_episodes[index], timestep // env.num_envs)
-            # The times in the file are relative to the one in its header
-            env.env_method("set_wrapper_attr", "t_start", read_start(path), indices=index)
+        continue_monitors(paths, env, model.num_timesteps, model.resumption["environment"])
+        return model
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         # The files with the run's original settings stay unchanged
         print(f"Log path: {self.save_path}")
+
+
+def continue_monitors(paths: Sequence[Path], env: VecEnv, timestep: int, state: Any) -> None:
+    """
+    Remove the episodes that ended after the state was saved, because the training repeats them.
+
+    :param paths: the file of each environment's monitor
+    :param env: the environments
+    :param timestep: the steps of all environments together when the state was saved
+    :param state: the environments' state; None if it was not saved
+    """
+    n_episodes: list[int | None] = [None] * env.num_envs
+    if state is not None:
+        # For the number of episodes; `learn` restores the environment again, before its first step
+        restore_environment(env, state)
+        n_episodes = [len(lengths) for lengths in env.get_attr("episode_lengths")]
+    for index, path in enumerate(paths):
+        cut_monitors(path, n_episodes[index], timestep // env.num_envs)
+        # The times in the file are relative to the one in its header
+        env.env_method("set_wrapper_attr", "t_start", read_start(path), indices=index)
 
 
 def read_run(folder: Path) -> tuple[argparse.Namespace, dict[str, Any]]:

@@ -1,0 +1,136 @@
+"""The runs of a group, trained as one population: each in its own folder, which is as it would be if it were trained alone."""
+
+import math
+import shutil
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import gymnasium as gym
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from benchmark.common.records import EVALUATION_SEED, FINAL_EPISODES
+from benchmark.sweeps.agent_experiments import AgentExperiment, NewAgent, ResumedAgent
+from benchmark.sweeps.claimed_runs import ClaimedRuns
+from benchmark.sweeps.groups import Group
+from benchmark.sweeps.population_reporter import PopulationReporter
+from benchmark.sweeps.run import begin, register_all
+from benchmark.sweeps.sharing import agent_arguments, ordinary_model
+from benchmark.sweeps.zoo_experiments import new_experiment, resumed_experiment
+from sb3_cgp import TrainingCheckpointCallback
+from sb3_cgp.population import Population, PopulationEvalCallback, evaluate_population
+from sb3_cgp.resumption.store import NoStateLeftError, StateStore
+from sb3_cgp.zoo.resumed_run import continue_monitors
+
+
+def train_group(
+    group: Group, folders: Sequence[Path], claimed: ClaimedRuns, watch: Callable[[int], None], device: str = "auto"
+) -> dict[int, float]:
+    """
+    Train a group of runs to their end, from the population's last state if it has one.
+
+    :param group: the group
+    :param folders: the folder of each run
+    :param claimed: receives the evaluations and the failures of the runs
+    :param watch: receives the environment steps of each run at every step, and may raise
+    :param device: device of the networks
+    :return: of the runs that have not failed, by their index, mean return of the final model over episodes that are the same
+        for all runs of a task
+    :raises FileExistsError: if a folder holds a run on another environment
+    """
+    group.write()
+    for run, folder in zip(group.runs, folders, strict=True):
+        register_all(run)
+        begin(run, folder)
+    try:
+        experiments, population = _set_up(group, folders, device)
+    except NoStateLeftError as error:
+        print(f"Population {group.folder.name} starts from the beginning: {error}", flush=True)
+        shutil.rmtree(group.states)
+        experiments, population = _set_up(group, folders, device)
+    assert population.env is not None
+    first = group.runs[0]
+    evaluation = PopulationEvalCallback(
+        _join(group, experiments, eval_env=True),
+        n_eval_episodes=first.evaluation_episodes,
+        eval_freq=first.evaluation_interval,
+        verbose=0,
+    )
+    # The reporter is the last one: where no step is left, the callback before it restores the evaluations
+    reporter = PopulationReporter(group.runs, folders, evaluation, claimed, watch)
+    saving = TrainingCheckpointCallback(len(group.runs) * first.checkpoint_interval, group.states, keep=1)
+    try:
+        population.learn(len(group.runs) * first.steps, callback=[evaluation, saving, reporter])
+        # Those of offline training, too
+        reporter.report_failures()
+        return _finish(group, experiments, population, evaluation.eval_env, claimed)
+    except ValueError:
+        # Raised when all agents have failed
+        reporter.report_failures()
+        if len(population.failed) < len(population):
+            raise
+        return {}
+    finally:
+        population.env.close()
+        evaluation.eval_env.close()
+
+
+def _set_up(group: Group, folders: Sequence[Path], device: str) -> tuple[list[AgentExperiment], Population]:
+    """Return rl_zoo3's manager of each run, and the population, which starts or continues."""
+    runs = group.runs
+    continues = bool(StateStore(group.states).steps())
+    kind, make = (ResumedAgent, resumed_experiment) if continues else (NewAgent, new_experiment)
+    experiments: list[AgentExperiment] = [make(kind, run, folder, device) for run, folder in zip(runs, folders, strict=True)]
+    set_random_seed(runs[0].seed)
+    for experiment in experiments:
+        experiment.setup_experiment()
+    env = _join(group, experiments)
+    if continues:
+        population = Population.resume(group.states, env, device=device)
+        assert population.resumption is not None
+        monitors = [folder / f"0.{Monitor.EXT}" for folder in folders]
+        continue_monitors(monitors, env, population.num_timesteps, population.resumption["environment"])
+        return experiments, population
+    arguments = [
+        agent_arguments(run.algo, experiment.arguments) | {"seed": run.seed}
+        for run, experiment in zip(runs, experiments, strict=True)
+    ]
+    return experiments, Population("MlpPolicy", env, arguments, device=device)
+
+
+def _join(group: Group, experiments: Sequence[AgentExperiment], eval_env: bool = False) -> VecEnv:
+    """Return the environments of all runs, each made and seeded by rl_zoo3's manager of its run."""
+    env = DummyVecEnv([partial(_only_env, experiment, eval_env) for experiment in experiments])
+    _seed(env, [run.seed for run in group.runs])
+    return env
+
+
+def _only_env(experiment: AgentExperiment, eval_env: bool) -> gym.Env:
+    env = experiment.create_envs(1, eval_env=eval_env)
+    assert isinstance(env, DummyVecEnv)
+    return env.envs[0]
+
+
+def _seed(env: VecEnv, seeds: Sequence[int]) -> None:
+    # SB3 counts the environments' seeds from one number
+    env._seeds = list(seeds)
+
+
+def _finish(
+    group: Group, experiments: Sequence[AgentExperiment], population: Population, env: VecEnv, claimed: ClaimedRuns
+) -> dict[int, float]:
+    """Save the models of the runs that have not failed, and return their final returns."""
+    healthy = [index for index, run in enumerate(group.runs) if claimed.is_open(run)]
+    for index in healthy:
+        experiment = experiments[index]
+        experiment.save_trained_model(ordinary_model(group.runs[index], experiment.arguments, population[index]))
+    if not healthy:
+        return {}
+    _seed(env, [EVALUATION_SEED] * len(group.runs))
+    finals = evaluate_population(population, env, FINAL_EPISODES)[0].mean(axis=1)
+    for index in healthy:
+        if not math.isfinite(finals[index]):
+            claimed.fail(group.runs[index], FloatingPointError(f"The final model's mean return is {finals[index]}"))
+    return {index: float(finals[index]) for index in healthy if claimed.is_open(group.runs[index])}
