@@ -6,6 +6,7 @@ Test CGP on environments of other packages, each installed from PyPI into a virt
 
 import argparse
 import json
+import os
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -45,7 +46,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         "--packages", nargs="+", default=names, choices=names, metavar="NAME", help=f"some of {', '.join(names)}"
     )
     parser.add_argument("--missing", action="store_true", help="only packages that have no record yet")
-    parser.add_argument("--keep", action="store_true", help="keep the virtual environments, and use those that are there")
+    parser.add_argument("--keep", action="store_true", help="keep the virtual environments, and what was checked")
     add("--python", sys.executable, "the interpreter that makes the virtual environments")
     add("--work", Path("build/environments"), "folder of the virtual environments and the checks' files", type=Path)
     add("--folder", "results/environments", "folder of the records", type=output_folder)
@@ -96,13 +97,15 @@ def test(package: Package, args: argparse.Namespace) -> Iterator[dict[str, Any]]
         "other_versions": {},
         "commit": commit(),
         "machine": machine(th.device("cpu")),
+        # Windows has no load average
+        "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
     }
     if "failure" in installation:
         print(f"  not installed: {installation['failure']}", flush=True)
     yield record
     for environment in package.environments if "failure" not in installation else ():
         name = canonicalize_name(environment.id.replace("/", "-").replace(" ", "-"))
-        found = check(environment, folder / "venv" / "bin" / "python", folder / name, args.timeout)
+        found = check(environment, folder / "venv" / "bin" / "python", folder / name, args.timeout, args.keep)
         versions, record["python"] = found.pop("versions"), found.pop("python", None)
         record["versions"] |= {name: versions[name] for name in package.distributions if name in versions}
         record["other_versions"] |= other_versions(versions)

@@ -284,8 +284,9 @@ def test_what_raises_is_named_and_ends_the_check(short, tmp_path):
 
 
 def test_learning_is_returns_beside_those_of_random_actions(short, tmp_path):
-    learning = Learning(50, dict(learning_starts=30))
+    learning = Learning(50, dict(learning_starts=30, gamma=0.9), normalize=True)
     code = COUNTS.replace("False, False, {}", "False, False, {'is_success': True}") + LIMITED
+    code += "\n\nfrom stable_baselines3.common.vec_env import DummyVecEnv\n\none = env\nenv = DummyVecEnv([lambda: one])"
     found = check.Report(tmp_path / "learnt.json")
     check.learnt(asdict(Environment("Counts", code, learning=learning)), tmp_path, found)
     assert [len(found.known[key]) for key in ("returns", "random_returns")] == [2, 2]
@@ -328,6 +329,7 @@ def test_a_page_has_returns_successes_and_what_was_noticed(monkeypatch):
         "python": "3.11.7",
         "commit": "abc",
         "machine": {"cpu": "A processor", "cores": 2},
+        "load_average": 3.4,
     }
     text = page({"works": record})
     cells = ["differs", "yes (0e+00)", "80 (12,346)", "-49.5 → -1.5; 0 → 19 of 20 (3,000 steps)"]
@@ -336,6 +338,7 @@ def test_a_page_has_returns_successes_and_what_was_noticed(monkeypatch):
         '`pip install "works<2"`',
         "- Tested: works 1.2, with Python 3.11.7. All versions are those of constraints.txt.",
         "- A note.",
+        "Commit abc, on A processor, 2 cores, load average 3.",
         "- Two trainings with one seed differ: the environment does not repeat itself.",
     ):
         assert line in text.splitlines()

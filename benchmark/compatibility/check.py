@@ -13,6 +13,7 @@ The module imports nothing of ``benchmark``, which needs more packages than the 
 import hashlib
 import json
 import platform
+import shutil
 import sys
 import time
 import traceback
@@ -30,7 +31,7 @@ from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_cgp import CGP, TrainingCheckpointCallback
 from sb3_cgp.resumption.environments import why_not_restorable
@@ -102,7 +103,7 @@ class Watch(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self.at_stop is None and self.num_timesteps >= STOP:
             self.at_stop = fingerprint(self.model)
-        if self.started is None and self.num_timesteps >= self.model.learning_starts + WARM_UP:
+        if self.started is None and self.num_timesteps >= LEARNING_STARTS + WARM_UP:
             self.started = self.num_timesteps, time.process_time()
 
     def _on_step(self) -> bool:
@@ -128,18 +129,26 @@ def make_env(code: str) -> Any:
     return names["env"]
 
 
-def make_model(environment: dict[str, Any], **arguments: Any) -> CGP:
+def make_model(environment: dict[str, Any], normalize: bool = False, **arguments: Any) -> tuple[CGP, VecEnv, spaces.Box]:
     """
     Make a model of CGP's defaults but for a short warm-up and a small replay buffer.
 
     :param environment: the declaration
+    :param normalize: whether VecNormalize is around the environment
     :param arguments: other arguments of CGP's
-    :return: the model, which has seeded its environment
+    :return: the model, its environment, which it has seeded, and the space of one action
     """
     if environment["replay_buffer"] is not None:
         arguments["replay_buffer_class"] = REPLAY_BUFFERS[environment["replay_buffer"]]
     short = dict(learning_starts=LEARNING_STARTS, buffer_size=environment["buffer_size"])
-    return CGP(environment["policy"], make_env(environment["code"]), **(DEFAULTS | short | arguments))
+    made = make_env(environment["code"])
+    if normalize:
+        made = VecNormalize(made, gamma=arguments["gamma"])
+    model = CGP(environment["policy"], made, **(DEFAULTS | short | arguments))
+    env = model.get_env()
+    assert env is not None
+    assert isinstance(env.action_space, spaces.Box)
+    return model, env, env.action_space
 
 
 def fingerprint(model: Any) -> dict[str, str]:
@@ -157,9 +166,10 @@ def fingerprint(model: Any) -> dict[str, str]:
     rows = buffer.buffer_size if buffer.full else buffer.pos
     for name, value in vars(buffer).items():
         fields = value if isinstance(value, dict) else {"": value}
-        arrays = {key: field for key, field in fields.items() if isinstance(field, np.ndarray | th.Tensor)}
-        # Rows that hold nothing yet are of memory that was not initialised
-        found |= {f"replay_buffer.{name}.{key}": np.asarray(array)[:rows] for key, array in arrays.items() if array.ndim > 1}
+        arrays = {key: np.asarray(each) for key, each in fields.items() if isinstance(each, np.ndarray | th.Tensor)}
+        # Rows that hold nothing yet are of memory that was not initialised; objects are infos, which hindsight replay ignores
+        kept = {key: array for key, array in arrays.items() if array.ndim > 1 and array.dtype != object}
+        found |= {f"replay_buffer.{name}.{key}": array[:rows] for key, array in kept.items()}
     found["counters"] = np.array([buffer.pos, buffer.full, model.num_timesteps, model._n_updates, model._episode_num])
     return {name: hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()[:16] for name, value in found.items()}
 
@@ -211,9 +221,8 @@ def whole(environment: dict[str, Any], folder: Path, report: Report) -> None:
     """
     watch = Watch()
     with report.doing("trains"):
-        model = make_model(environment)
-        env = model.get_env()
-        report.write(observations=str(env.observation_space), actions=str(env.action_space), n_envs=env.num_envs)
+        model, env, space = make_model(environment)
+        report.write(observations=str(env.observation_space), actions=str(space), n_envs=env.num_envs)
         model.learn(STEPS, callback=watch)
         assert model._n_updates > 0, "no gradient step was taken"
         report.write(at_stop=watch.at_stop, at_end=fingerprint(model), steps_per_second=watch.steps_per_second)
@@ -229,7 +238,7 @@ def whole(environment: dict[str, Any], folder: Path, report: Report) -> None:
         observations = random_steps(env, 5)
         expected = [model.predict(each, deterministic=True)[0] for each in observations]
         for actions in expected:
-            assert within(actions, env.action_space), f"{actions} is not within {env.action_space}"
+            assert within(actions, space), f"{actions} is not within {space}"
     if report.known["errors"]:
         return
     with report.doing("saves and loads"):
@@ -245,7 +254,7 @@ def whole(environment: dict[str, Any], folder: Path, report: Report) -> None:
         for each, actions in zip(observations, expected, strict=True):
             inputs = each if isinstance(each, dict) else {"observation": each}
             for found in (session.run(None, inputs)[0], without_pickle.predict(each)[0]):
-                largest = max(largest, difference(found, actions, env.action_space))
+                largest = max(largest, difference(found, actions, space))
         report.write(export_difference=largest)
 
 
@@ -258,8 +267,9 @@ def stopped(environment: dict[str, Any], folder: Path, report: Report) -> None:
     :param report: takes the results
     """
     watch = Watch(stops=True)
+    shutil.rmtree(folder / "state", ignore_errors=True)
     with report.doing("stops"):
-        model = make_model(environment)
+        model, _, _ = make_model(environment)
         try:
             model.learn(STEPS, callback=[TrainingCheckpointCallback(STOP, folder / "state"), watch])
         except StopError:
@@ -274,8 +284,12 @@ def resumed(environment: dict[str, Any], folder: Path, report: Report) -> None:
     :param folder: for the files
     :param report: takes the results
     """
+    # The resumed training saves later states
+    copy = folder / "resumed"
+    shutil.rmtree(copy, ignore_errors=True)
     with report.doing("resumes"):
-        model = CGP.resume(folder / "state", make_env(environment["code"]), device="cpu")
+        shutil.copytree(folder / "state", copy)
+        model = CGP.resume(copy, make_env(environment["code"]), device="cpu")
         model.learn(STEPS)
         assert model.num_timesteps >= STEPS, f"the training ended at step {model.num_timesteps}"
         report.write(at_end=fingerprint(model))
@@ -291,11 +305,12 @@ def learnt(environment: dict[str, Any], folder: Path, report: Report) -> None:
     """
     learning = environment["learning"]
     with report.doing("learns"):
-        model = make_model(environment, **learning["arguments"])
-        env = model.get_env()
+        model, env, _ = make_model(environment, learning["normalize"], **learning["arguments"])
         started = time.process_time()
         model.learn(learning["steps"])
         report.write(learning_seconds=time.process_time() - started)
+        if isinstance(env, VecNormalize):
+            env.training = env.norm_reward = False
         actor, actor_successes = returns(model, env)
         random, random_successes = returns(RandomActions(env), env)
         report.write(returns=actor, random_returns=random, successes=actor_successes, random_successes=random_successes)
@@ -337,6 +352,7 @@ def returns(policy: Any, env: VecEnv) -> tuple[list[float], int | None]:
             successes.append(bool(names["info"]["is_success"]))
 
     found, _ = evaluate_policy(policy, env, EPISODES, return_episode_rewards=True, callback=note, warn=False)
+    assert isinstance(found, list)
     return [float(each) for each in found], sum(successes) if successes else None
 
 
@@ -352,7 +368,7 @@ def main() -> None:
         warnings.simplefilter("always")
         {"whole": whole, "stopped": stopped, "resumed": resumed, "learnt": learnt}[part](environment, folder, report)
     messages = dict.fromkeys(str(each.message) for each in caught if each.category is UserWarning)
-    report.write(warnings=list(messages), doing=None)
+    report.write(warnings=list(messages), doing=None, complete=True)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ SCRIPT = Path(__file__).with_name("check.py")
 HEADLESS = {"SDL_VIDEODRIVER": "dummy", "MPLBACKEND": "agg"}
 
 
-def check(environment: Environment, python: Path, folder: Path, timeout: float) -> dict[str, Any]:
+def check(environment: Environment, python: Path, folder: Path, timeout: float, reuse: bool = False) -> dict[str, Any]:
     """
     Train, predict, save, load, export, stop, resume, and, where it is declared, learn.
 
@@ -23,20 +23,25 @@ def check(environment: Environment, python: Path, folder: Path, timeout: float) 
     :param python: the interpreter of the package's virtual environment
     :param folder: for the files of the check, which is emptied
     :param timeout: seconds for each part
+    :param reuse: whether the folder of an interrupted check is kept, and the parts that it has completed are not repeated
     :return: the row of the environment, see :func:`summary`
     """
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    (folder / "environment.json").write_text(json.dumps(asdict(environment)))
+    declared, declaration = folder / "environment.json", json.dumps(asdict(environment))
+    if not (reuse and declared.is_file() and declared.read_text() == declaration):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        declared.write_text(declaration)
     parts = ["whole", "stopped", "resumed", *(["learnt"] if environment.learning is not None else [])]
     found: dict[str, dict[str, Any]] = {}
     for part in parts:
-        command = [str(python), str(SCRIPT), part, str(folder)]
-        ended = execute(command, folder, folder / f"{part}.log", timeout, HEADLESS)
-        written = folder / f"{part}.json"
-        found[part] = json.loads(written.read_text()) if written.is_file() else {"errors": {}, "warnings": []}
-        if not ended.succeeded:
-            found[part]["errors"][found[part].get("doing") or "starts"] = f"the process ended by {ended.reason}"
+        found[part] = _read(folder / f"{part}.json")
+        if not found[part].get("complete"):
+            (folder / f"{part}.json").unlink(missing_ok=True)
+            command = [str(python), str(SCRIPT), part, str(folder)]
+            ended = execute(command, folder, folder / f"{part}.log", timeout, HEADLESS)
+            found[part] = _read(folder / f"{part}.json")
+            if not ended.succeeded:
+                found[part]["errors"][found[part].get("doing") or "starts"] = f"the process ended by {ended.reason}"
         # The same would stop the other parts
         if {"starts", "trains"} & found[part]["errors"].keys():
             break
@@ -52,7 +57,7 @@ def summary(found: dict[str, dict[str, Any]]) -> dict[str, Any]:
         training was resumed ("resumes": "to the bit", "from a new episode", "differs", or None if it was not); and all other
         values as they were written
     """
-    compared = ("at_stop", "at_end", "versions", "warnings", "errors", "doing")
+    compared = ("at_stop", "at_end", "versions", "warnings", "errors", "doing", "complete")
     row = {key: _clean(value) for part in found.values() for key, value in part.items() if key not in compared}
     row["versions"] = found["whole"].get("versions", {})
     for key in ("errors", "warnings"):
@@ -67,6 +72,11 @@ def summary(found: dict[str, dict[str, Any]]) -> dict[str, Any]:
     else:
         row["resumes"] = "to the bit" if is_same else "differs"
     return row
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return what a part has written."""
+    return json.loads(path.read_text()) if path.is_file() else {"errors": {}, "warnings": []}
 
 
 def _same(one: dict[str, Any], other: dict[str, Any], key: str) -> bool | None:

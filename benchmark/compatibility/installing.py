@@ -28,7 +28,7 @@ def read_pins(constraints: Path) -> dict[str, str]:
     :param constraints: the file
     :return: versions by normalised name
     """
-    pins = {}
+    pins: dict[str, str] = {}
     for line in constraints.read_text().splitlines():
         if line.strip() and not line.startswith("#"):
             requirement = Requirement(line)

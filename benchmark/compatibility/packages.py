@@ -11,10 +11,12 @@ class Learning:
 
     :param steps: environment steps
     :param arguments: arguments of CGP's other than the defaults
+    :param normalize: whether VecNormalize is around the environment
     """
 
     steps: int
     arguments: dict[str, Any]
+    normalize: bool = False
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,8 @@ def made(env_id: str, imported: str = "", arguments: str = "") -> str:
 HINDSIGHT: dict[str, Any] = dict(policy="MultiInputPolicy", replay_buffer="HerReplayBuffer")
 # As `hyperparams/cgp.yml` has them
 SMALL: dict[str, Any] = dict(learning_starts=1_000, buffer_size=10_000, policy_kwargs=dict(net_arch=[64, 64]))
-PENDULUM = Learning(10_000, dict(learning_rate=2e-3, batch_size=64, gamma=0.98, tau=0.02, **SMALL))
-REACH = Learning(3_000, dict(batch_size=256, gamma=0.95, **SMALL))
+PENDULUM = Learning(5_000, dict(learning_rate=2e-3, batch_size=64, gamma=0.98, tau=0.02, **SMALL))
+REACH = Learning(3_000, dict(batch_size=256, gamma=0.95, **SMALL), normalize=True)
 # envpool's environments are no environments of SB3's
 ENVPOOL = """\
 import envpool
@@ -178,7 +180,7 @@ PACKAGES = (
     ),
     Package(
         "dm_control",
-        ("dm_control<=1.0.40", "shimmy", MUJOCO),
+        ("dm_control<=1.0.40", "shimmy[dm-control]", MUJOCO),
         ("dm-control", "shimmy", "mujoco"),
         (
             Environment(

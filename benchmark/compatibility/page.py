@@ -25,9 +25,11 @@ NOTES = """\
 - **exports**: `model.export`. The number is the largest difference between the actions of `predict` and those of `policy.onnx`
   in onnxruntime or of `load_weights`, in units of the width of the action space.
 - **steps/s**: environment steps per second of processor time, with one thread and one gradient step a step; in brackets those
-  of the environment alone, with random actions.
-- **learns**: the mean return of 20 episodes by random actions, and by the actor after a training of so many steps; and how
-  many of these episodes ended in success, where the environment reports it.
+  of the environment alone, with random actions. Both are too low where the load average, which each section gives, exceeds
+  the number of cores.
+- **learns**: the mean return of 20 episodes by random actions, and by the actor after a training of so many steps, whose
+  arguments are in `benchmark/compatibility/packages.py`; and how many of these episodes ended in success, where the
+  environment reports it.
 """
 UNKNOWN = "–"
 
@@ -117,9 +119,16 @@ def _section(package: Package, record: dict[str, Any]) -> str:
     for environment in package.environments:
         found = record["environments"].get(environment.id, {})
         facts = [*environment.notes, *_facts(found)]
-        lines += ["", f"{environment.id}:", "", "```py", environment.code, "```", "", *(f"- {fact}" for fact in facts)]
-    lines += ["", f"Commit {record['commit']}, on {record['machine']['cpu']}, {record['machine']['cores']} cores."]
+        lines += ["", f"{environment.id}:", "", "```py", environment.code, "```"]
+        lines += ["", *(f"- {fact}" for fact in facts)] if facts else []
+    lines += ["", _conditions(record)]
     return "\n".join(lines) + "\n"
+
+
+def _conditions(record: dict[str, Any]) -> str:
+    """Return where the package was tested."""
+    load = "" if record["load_average"] is None else f", load average {record['load_average']:.0f}"
+    return f"Commit {record['commit']}, on {record['machine']['cpu']}, {record['machine']['cores']} cores{load}."
 
 
 def _quoted(requirement: str) -> str:
