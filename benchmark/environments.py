@@ -77,6 +77,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         for found in test(package, args):
             write_json(record, found)
             write_page(args)
+    # Also where nothing is left to test, as with other declarations or another page
+    write_page(args)
 
 
 def test(package: Package, args: argparse.Namespace) -> Iterator[dict[str, Any]]:

@@ -344,6 +344,13 @@ def test_a_page_has_returns_successes_and_what_was_noticed(monkeypatch):
         assert line in text.splitlines()
 
 
+def test_the_page_of_the_documentation_is_that_of_the_records():
+    root = Path(__file__).parent.parent
+    records = [json.loads(path.read_text()) for path in (root / "benchmark/results/environments").glob("*.json")]
+    assert records
+    assert (root / "docs/tested_environments.md").read_text() == page({record["package"]: record for record in records})
+
+
 @pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.name)
 def test_a_declaration_is_whole(package):
     ids = [environment.id for environment in package.environments]

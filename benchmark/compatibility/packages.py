@@ -63,19 +63,23 @@ class Package:
     notes: tuple[str, ...] = field(default=())
 
 
-def made(env_id: str, imported: str = "", arguments: str = "") -> str:
+def made(env_id: str, imported: str = "", arguments: str = "", replayed: bool = False) -> str:
     """
     Return the code that makes an environment by its id.
 
     :param env_id: the id
     :param imported: the module that registers it; empty for Gymnasium's own
     :param arguments: further arguments of ``make_vec_env``
+    :param replayed: whether :func:`~sb3_cgp.resumption.replayed` is around it
     """
     lines = [f"import {imported}"] if imported else []
     lines += ["from stable_baselines3.common.env_util import make_vec_env", ""]
-    return "\n".join([*lines, f'env = make_vec_env("{env_id}"{", " if arguments else ""}{arguments})'])
+    lines += ["from sb3_cgp.resumption import replayed", ""] if replayed else []
+    given = [f'"{env_id}"', *([arguments] if arguments else []), *(["wrapper_class=replayed"] if replayed else [])]
+    return "\n".join([*lines, f"env = make_vec_env({', '.join(given)})"])
 
 
+REPLAYED = "Without `replayed`, which repeats the interrupted episode, a resumed training begins a new one."
 HINDSIGHT: dict[str, Any] = dict(policy="MultiInputPolicy", replay_buffer="HerReplayBuffer")
 # As `hyperparams/cgp.yml` has them
 SMALL: dict[str, Any] = dict(learning_starts=1_000, buffer_size=10_000, policy_kwargs=dict(net_arch=[64, 64]))
@@ -89,10 +93,6 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
 
 class EnvPoolAdapter(VecEnvWrapper):
-    def __init__(self, pool):
-        pool.num_envs = pool.spec.config.num_envs
-        super().__init__(pool)
-
     def seed(self, seed=None):
         return [None] * self.num_envs  # the seed is an argument of envpool.make
 
@@ -137,11 +137,9 @@ PACKAGES = (
             ),
             Environment(
                 "LunarLanderContinuous-v3",
-                "from stable_baselines3.common.env_util import make_vec_env\n\n"
-                "from sb3_cgp.resumption import replayed\n\n"
-                'env = make_vec_env("LunarLanderContinuous-v3", wrapper_class=replayed)',
+                made("LunarLanderContinuous-v3", replayed=True),
                 wrappers="`replayed`",
-                notes=("Box2D's state is restored by `replayed`, which repeats the episode.",),
+                notes=(REPLAYED,),
             ),
             Environment(
                 "CarRacing-v3",
@@ -210,18 +208,30 @@ PACKAGES = (
         "gym-pusht",
         ("gym-pusht",),
         ("gym-pusht", "pymunk"),
-        (Environment("gym_pusht/PushT-v0", made("gym_pusht/PushT-v0", "gym_pusht", 'env_kwargs=dict(obs_type="state")')),),
+        (
+            Environment(
+                "gym_pusht/PushT-v0",
+                made("gym_pusht/PushT-v0", "gym_pusht", 'env_kwargs=dict(obs_type="state")', replayed=True),
+                wrappers="`replayed`",
+                notes=(REPLAYED,),
+            ),
+        ),
     ),
     Package(
         "highway-env",
         ("highway-env",),
         ("highway-env",),
         (
-            Environment("parking-v0", made("parking-v0", "highway_env"), **HINDSIGHT),
             Environment(
-                "highway-v0",
-                made("highway-v0", "highway_env", 'env_kwargs=dict(config={"action": {"type": "ContinuousAction"}})'),
-                notes=("The default actions are discrete: `ContinuousAction` is set.",),
+                "parking-v0",
+                made("parking-v0", "highway_env", replayed=True),
+                wrappers="`replayed`",
+                notes=(
+                    REPLAYED,
+                    "Other tasks have discrete actions by default; "
+                    '`env_kwargs=dict(config={"action": {"type": "ContinuousAction"}})` makes them continuous.',
+                ),
+                **HINDSIGHT,
             ),
         ),
     ),
@@ -230,8 +240,18 @@ PACKAGES = (
         ("pybullet_envs_gymnasium",),
         ("pybullet-envs-gymnasium", "pybullet"),
         (
-            Environment("HalfCheetahBulletEnv-v0", made("HalfCheetahBulletEnv-v0", "pybullet_envs_gymnasium")),
-            Environment("InvertedPendulumBulletEnv-v0", made("InvertedPendulumBulletEnv-v0", "pybullet_envs_gymnasium")),
+            Environment(
+                "InvertedPendulumBulletEnv-v0",
+                made("InvertedPendulumBulletEnv-v0", "pybullet_envs_gymnasium", replayed=True),
+                wrappers="`replayed`",
+                notes=(REPLAYED,),
+            ),
+            Environment(
+                "HalfCheetahBulletEnv-v0",
+                made("HalfCheetahBulletEnv-v0", "pybullet_envs_gymnasium", replayed=True),
+                wrappers="`replayed`",
+                notes=(REPLAYED,),
+            ),
         ),
     ),
     Package(

@@ -127,7 +127,7 @@ def _section(package: Package, record: dict[str, Any]) -> str:
 
 def _conditions(record: dict[str, Any]) -> str:
     """Return where the package was tested."""
-    load = "" if record["load_average"] is None else f", load average {record['load_average']:.0f}"
+    load = "" if record.get("load_average") is None else f", load average {record['load_average']:.0f}"
     return f"Commit {record['commit']}, on {record['machine']['cpu']}, {record['machine']['cores']} cores{load}."
 
 
