@@ -114,6 +114,30 @@ class EnvPoolAdapter(VecEnvWrapper):
 
 
 env = VecMonitor(EnvPoolAdapter(envpool.make("Pendulum-v1", env_type="gymnasium", num_envs=2, seed=0)))"""
+SUPERSUIT = """\
+import supersuit
+from mpe2 import simple_spread_v3
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
+
+
+class SupersuitAdapter(VecEnvWrapper):
+    def seed(self, seed=None):
+        self.venv.venv.reset(seed=seed)
+        return [seed] * self.num_envs
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for info, done in zip(infos, dones):
+            info["TimeLimit.truncated"] = bool(done)  # these episodes end by their length alone
+        return observations, rewards, dones, infos
+
+
+agents = supersuit.pettingzoo_env_to_vec_env_v1(simple_spread_v3.parallel_env(continuous_actions=True))
+env = supersuit.concat_vec_envs_v1(agents, 1, base_class="stable_baselines3")
+env = VecMonitor(SupersuitAdapter(env))"""
 # MuJoCo's version is that of constraints.txt: later ones lack a field that these packages read
 MUJOCO = "mujoco==3.8.0"
 
@@ -256,7 +280,7 @@ PACKAGES = (
     ),
     Package(
         "robosuite",
-        ("robosuite",),
+        ("robosuite", "h5py"),
         ("robosuite", "mujoco"),
         (
             Environment(
@@ -271,6 +295,7 @@ PACKAGES = (
                 wrappers="`GymWrapper`",
             ),
         ),
+        ("robosuite's wrappers import h5py, which pip does not install with it.",),
     ),
     Package(
         "mpe2",
@@ -279,12 +304,12 @@ PACKAGES = (
         (
             Environment(
                 "simple_spread_v3",
-                "import supersuit\nfrom mpe2 import simple_spread_v3\n\n"
-                "agents = simple_spread_v3.parallel_env(continuous_actions=True)\n"
-                "env = supersuit.pettingzoo_env_to_vec_env_v1(agents)\n"
-                'env = supersuit.concat_vec_envs_v1(env, 1, base_class="stable_baselines3")',
-                wrappers="supersuit's vector environments",
-                notes=("The agents share one policy: each is an environment of the vector environment.",),
+                SUPERSUIT,
+                wrappers="supersuit's, an adapter",
+                notes=(
+                    "The agents share one policy: each is an environment of the vector environment.",
+                    "The adapter seeds the environments, and reports the time limit that ends an episode: supersuit does neither.",
+                ),
             ),
         ),
     ),
