@@ -17,6 +17,8 @@ PARAMS :=
 ARGS :=
 # The folder of the run to resume.
 RUN :=
+# The packages whose environments are tested. Empty: all.
+PACKAGES :=
 
 PYTHON ?= python3
 VENV := .venv
@@ -34,15 +36,16 @@ DOCS_INSTALLED := $(STAMP)docs
 REQUIREMENTS := setup.cfg pyproject.toml constraints.txt _build_backend.py sb3_cgp/version.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help train resume sweeps docs test test-slow lint format clean
+.PHONY: help train resume sweeps docs test test-slow test-environments lint format clean
 
 help: ## list the goals
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-17s %s\n", $$1, $$2}' Makefile
 	@echo
 	@echo "make train takes ALGO=$(ALGO) ENV=$(ENV) SEED=$(SEED) STEPS= EVAL_FREQ= EVAL_EPISODES=$(EVAL_EPISODES) THREADS=$(THREADS) LOGS=$(LOGS)"
 	@echo "PARAMS= (hyperparameters) ARGS= (other options of rl_zoo3.train), as in"
 	@echo "  make train ENV=HalfCheetah-v5 STEPS=60000 SEED=1"
 	@echo "  make train ALGO=td3 ENV=HalfCheetah-v5 PARAMS=\"batch_size:128 learning_starts:10000\" ARGS=\"--save-freq 10000\""
+	@echo "make test-environments takes PACKAGES=\"panda-gym metaworld\" and ARGS= (other options of benchmark.environments)"
 	@echo "Every goal that needs Python takes PYTHON=$(PYTHON) (3.10 or newer)."
 
 train: $(INSTALLED) ## install, train with rl_zoo3, evaluate and draw the learning curve
@@ -77,6 +80,9 @@ test: lint ## install, lint and run the quick tests on all cores, with coverage
 
 test-slow: $(TESTS_INSTALLED) ## run the tests that take minutes: learning, packaging
 	$(PYTEST) --dist loadfile -m slow
+
+test-environments: $(SWEEPS_INSTALLED) ## test CGP on other packages' environments, each in a virtual environment of its own
+	$(IN_VENV) -m benchmark.environments $(if $(PACKAGES),--packages $(PACKAGES)) $(ARGS)
 
 lint: $(TESTS_INSTALLED) ## check by ruff, black, import-linter and mypy, changing nothing
 	$(IN_VENV) -m ruff check .

@@ -227,10 +227,21 @@ def test_old_python_is_refused_by_name(clone: Clone) -> None:
     assert not starting(calls, "-m venv")
 
 
+def test_environments_of_other_packages_are_named(clone: Clone) -> None:
+    calls, ended = clone.make("test-environments", "PACKAGES=panda-gym mpe2", "ARGS=--keep")
+    assert ended.returncode == 0, ended.stderr
+    assert calls[-2:] == [
+        "-m pip install -c constraints.txt -e .[sweeps]",
+        "-m benchmark.environments --packages panda-gym mpe2 --keep",
+    ]
+    calls, _ = clone.make("test-environments", PACKAGES="from the environment")
+    assert calls[-1] == "-m benchmark.environments"
+
+
 def test_help_is_the_default_and_lists_every_goal(clone: Clone) -> None:
     calls, ended = clone.make()
     assert not calls
-    for goal in ("train", "resume", "sweeps", "docs", "test", "test-slow", "lint", "format", "clean"):
+    for goal in ("train", "resume", "sweeps", "docs", "test", "test-slow", "test-environments", "lint", "format", "clean"):
         assert f"make {goal} " in ended.stdout
 
 

@@ -9,12 +9,14 @@ from sb3_cgp.guards.networks import NetworkGuard
 from sb3_cgp.guards.normalisation import NormalisationGuard
 from sb3_cgp.guards.parts import PartsGuard
 from sb3_cgp.guards.paths import PathGuard
+from sb3_cgp.guards.seeds import SeedGuard
 from sb3_cgp.guards.transitions import TransitionGuard
 from sb3_cgp.guards.workers import WorkerGuard
 
 
 class GuardedAlgorithm(
     PathGuard,
+    SeedGuard,
     WorkerGuard,
     ExplanationGuard,
     DummyVecEnvGuard,

@@ -1,0 +1,345 @@
+"""The packages whose environments are tested: what pip installs, how environments are made, and what to know. Data alone."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Learning:
+    """
+    A short training that shows whether CGP learns.
+
+    :param steps: environment steps
+    :param arguments: arguments of CGP's other than the defaults
+    :param normalize: whether VecNormalize is around the environment
+    """
+
+    steps: int
+    arguments: dict[str, Any]
+    normalize: bool = False
+
+
+@dataclass(frozen=True)
+class Environment:
+    """
+    An environment, and the arguments of CGP's that it needs.
+
+    :param id: its name in the table
+    :param code: Python that assigns it to ``env``; the page shows it
+    :param policy: the policy's alias
+    :param replay_buffer: the name of the replay buffer's class; None for CGP's own
+    :param wrappers: what is around the environment, in the table's words
+    :param buffer_size: transitions in the check's replay buffer, which are few where they are images
+    :param learning: a training that shows whether CGP learns; None for "not tested"
+    :param notes: sentences on what to know
+    """
+
+    id: str
+    code: str
+    policy: str = "MlpPolicy"
+    replay_buffer: str | None = None
+    wrappers: str = ""
+    buffer_size: int = 1_000
+    learning: Learning | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Package:
+    """
+    A package of environments, which is installed into a virtual environment of its own.
+
+    :param name: the package's name in commands and in the table
+    :param requirements: what pip installs
+    :param distributions: those whose versions the table gives, by their normalised names
+    :param environments: the environments
+    :param notes: sentences on what to know of all of them
+    """
+
+    name: str
+    requirements: tuple[str, ...]
+    distributions: tuple[str, ...]
+    environments: tuple[Environment, ...]
+    notes: tuple[str, ...] = field(default=())
+
+
+def made(env_id: str, imported: str = "", arguments: str = "", replayed: bool = False) -> str:
+    """
+    Return the code that makes an environment by its id.
+
+    :param env_id: the id
+    :param imported: the module that registers it; empty for Gymnasium's own
+    :param arguments: further arguments of ``make_vec_env``
+    :param replayed: whether :func:`~sb3_cgp.resumption.replayed` is around it
+    """
+    lines = [f"import {imported}"] if imported else []
+    lines += ["from stable_baselines3.common.env_util import make_vec_env", ""]
+    lines += ["from sb3_cgp.resumption import replayed", ""] if replayed else []
+    given = [f'"{env_id}"', *([arguments] if arguments else []), *(["wrapper_class=replayed"] if replayed else [])]
+    return "\n".join([*lines, f"env = make_vec_env({', '.join(given)})"])
+
+
+REPLAYED = "Without `replayed`, which repeats the interrupted episode, a resumed training begins a new one."
+HINDSIGHT: dict[str, Any] = dict(policy="MultiInputPolicy", replay_buffer="HerReplayBuffer")
+# As `hyperparams/cgp.yml` has them
+SMALL: dict[str, Any] = dict(learning_starts=1_000, buffer_size=10_000, policy_kwargs=dict(net_arch=[64, 64]))
+PENDULUM = Learning(5_000, dict(learning_rate=2e-3, batch_size=64, gamma=0.98, tau=0.02, **SMALL))
+REACH = Learning(3_000, dict(batch_size=256, gamma=0.95, **SMALL), normalize=True)
+# envpool's environments are no environments of SB3's
+ENVPOOL = """\
+import envpool
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
+
+
+class EnvPoolAdapter(VecEnvWrapper):
+    def seed(self, seed=None):
+        return [None] * self.num_envs  # the seed is an argument of envpool.make
+
+    def reset(self):
+        return self.venv.reset()[0]
+
+    def step_async(self, actions):
+        self.actions = actions
+
+    def step_wait(self):
+        observations, rewards, terminated, truncated, _ = self.venv.step(self.actions)
+        observations, dones = observations.copy(), terminated | truncated
+        infos = [{} for _ in dones]
+        for i in np.flatnonzero(dones):
+            infos[i]["terminal_observation"] = observations[i].copy()
+            infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
+            observations[i] = self.venv.reset(np.array([i]))[0][0]
+        return observations, rewards, dones, infos
+
+
+env = VecMonitor(EnvPoolAdapter(envpool.make("Pendulum-v1", env_type="gymnasium", num_envs=2, seed=0)))"""
+SUPERSUIT = """\
+import supersuit
+from mpe2 import simple_spread_v3
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
+
+
+class SupersuitAdapter(VecEnvWrapper):
+    def seed(self, seed=None):
+        self.venv.venv.reset(seed=seed)
+        return [seed] * self.num_envs
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for info, done in zip(infos, dones):
+            info["TimeLimit.truncated"] = bool(done)  # these episodes end by their length alone
+        return observations, rewards, dones, infos
+
+
+agents = supersuit.pettingzoo_env_to_vec_env_v1(simple_spread_v3.parallel_env(continuous_actions=True))
+env = supersuit.concat_vec_envs_v1(agents, 1, base_class="stable_baselines3")
+env = VecMonitor(SupersuitAdapter(env))"""
+# MuJoCo's version is that of constraints.txt: later ones lack a field that these packages read
+MUJOCO = "mujoco==3.8.0"
+
+PACKAGES = (
+    Package(
+        "gymnasium",
+        ("gymnasium[classic-control,mujoco,box2d]",),
+        ("gymnasium", "mujoco", "box2d"),
+        (
+            Environment("Pendulum-v1", made("Pendulum-v1"), learning=PENDULUM),
+            Environment(
+                "MountainCarContinuous-v0",
+                made("MountainCarContinuous-v0"),
+                notes=("A first reward is found by action noise that is correlated in time: `hyperparams/cgp.yml` has it.",),
+            ),
+            Environment("HalfCheetah-v5", made("HalfCheetah-v5")),
+            Environment(
+                "Humanoid-v5",
+                made("Humanoid-v5"),
+                notes=("Observations are float64, and so are the exported policy's inputs.",),
+            ),
+            Environment(
+                "LunarLanderContinuous-v3",
+                made("LunarLanderContinuous-v3", replayed=True),
+                wrappers="`replayed`",
+                notes=(REPLAYED,),
+            ),
+            Environment(
+                "CarRacing-v3",
+                made("CarRacing-v3"),
+                policy="CnnPolicy",
+                buffer_size=300,
+                notes=("Observations are images: allow for the memory of `buffer_size`, and take a GPU.",),
+            ),
+        ),
+    ),
+    Package(
+        "gymnasium-robotics",
+        ("gymnasium-robotics", MUJOCO),
+        ("gymnasium-robotics", "mujoco"),
+        (
+            Environment("FetchReach-v4", made("FetchReach-v4", "gymnasium_robotics"), learning=REACH, **HINDSIGHT),
+            Environment("FetchPush-v4", made("FetchPush-v4", "gymnasium_robotics"), **HINDSIGHT),
+            Environment("AdroitHandDoor-v1", made("AdroitHandDoor-v1", "gymnasium_robotics")),
+            Environment(
+                "PointMaze_UMaze-v3",
+                made("PointMaze_UMaze-v3", "gymnasium_robotics", "env_kwargs=dict(max_episode_steps=100)"),
+                **HINDSIGHT,
+                notes=("A maze's robot is an environment within the environment, whose state CGP does not know.",),
+            ),
+        ),
+    ),
+    Package(
+        "panda-gym",
+        ("panda-gym",),
+        ("panda-gym", "pybullet"),
+        (
+            Environment("PandaReach-v3", made("PandaReach-v3", "panda_gym"), learning=REACH, **HINDSIGHT),
+            Environment("PandaPickAndPlace-v3", made("PandaPickAndPlace-v3", "panda_gym"), **HINDSIGHT),
+        ),
+        ("Each reset without a seed draws its goal from a new generator, so that two trainings of one seed differ.",),
+    ),
+    Package(
+        "dm_control",
+        ("dm_control<=1.0.40", "shimmy[dm-control]", MUJOCO),
+        ("dm-control", "shimmy", "mujoco"),
+        (
+            Environment(
+                "dm_control/cartpole-swingup-v0", made("dm_control/cartpole-swingup-v0", "shimmy"), policy="MultiInputPolicy"
+            ),
+            Environment(
+                "dm_control/walker-walk-v0",
+                "import shimmy\nfrom gymnasium.wrappers import FlattenObservation\n"
+                "from stable_baselines3.common.env_util import make_vec_env\n\n"
+                'env = make_vec_env("dm_control/walker-walk-v0", wrapper_class=FlattenObservation)',
+                wrappers="`FlattenObservation`",
+            ),
+        ),
+        ("dm_control 1.0.41 and later need a newer MuJoCo than constraints.txt has.",),
+    ),
+    Package(
+        "metaworld",
+        ("metaworld",),
+        ("metaworld", "mujoco"),
+        (
+            Environment(
+                "Meta-World/MT1 reach-v3", made("Meta-World/MT1", "metaworld", 'env_kwargs=dict(env_name="reach-v3", seed=0)')
+            ),
+        ),
+    ),
+    Package(
+        "gym-pusht",
+        ("gym-pusht",),
+        ("gym-pusht", "pymunk"),
+        (
+            Environment(
+                "gym_pusht/PushT-v0",
+                made("gym_pusht/PushT-v0", "gym_pusht", 'env_kwargs=dict(obs_type="state")', replayed=True),
+                wrappers="`replayed`",
+                notes=(REPLAYED,),
+            ),
+        ),
+    ),
+    Package(
+        "highway-env",
+        ("highway-env",),
+        ("highway-env",),
+        (
+            Environment(
+                "parking-v0",
+                made("parking-v0", "highway_env", replayed=True),
+                wrappers="`replayed`",
+                notes=(
+                    REPLAYED,
+                    "Other tasks have discrete actions by default; "
+                    '`env_kwargs=dict(config={"action": {"type": "ContinuousAction"}})` makes them continuous.',
+                ),
+                **HINDSIGHT,
+            ),
+        ),
+    ),
+    Package(
+        "pybullet_envs_gymnasium",
+        ("pybullet_envs_gymnasium",),
+        ("pybullet-envs-gymnasium", "pybullet"),
+        (
+            Environment(
+                "InvertedPendulumBulletEnv-v0",
+                made("InvertedPendulumBulletEnv-v0", "pybullet_envs_gymnasium", replayed=True),
+                wrappers="`replayed`",
+                notes=(REPLAYED,),
+            ),
+            Environment(
+                "HalfCheetahBulletEnv-v0",
+                made("HalfCheetahBulletEnv-v0", "pybullet_envs_gymnasium", replayed=True),
+                wrappers="`replayed`",
+                notes=(REPLAYED,),
+            ),
+        ),
+    ),
+    Package(
+        "robosuite",
+        ("robosuite", "h5py"),
+        ("robosuite", "mujoco"),
+        (
+            Environment(
+                "Lift (Panda)",
+                "import robosuite\nfrom robosuite.wrappers import GymWrapper\n"
+                "from stable_baselines3.common.env_util import make_vec_env\n\n\n"
+                "def make():\n"
+                '    lift = robosuite.make("Lift", robots="Panda", has_renderer=False, has_offscreen_renderer=False,\n'
+                "                          use_camera_obs=False, reward_shaping=True, horizon=100)\n"
+                "    return GymWrapper(lift)\n\n\n"
+                "env = make_vec_env(make)",
+                wrappers="`GymWrapper`",
+            ),
+        ),
+        ("robosuite's wrappers import h5py, which pip does not install with it.",),
+    ),
+    Package(
+        "mpe2",
+        ("mpe2", "supersuit"),
+        ("mpe2", "supersuit", "pettingzoo"),
+        (
+            Environment(
+                "simple_spread_v3",
+                SUPERSUIT,
+                wrappers="supersuit's, an adapter",
+                notes=(
+                    "The agents share one policy: each is an environment of the vector environment.",
+                    "The adapter seeds the environments, and reports the time limit that ends an episode: supersuit does neither.",
+                ),
+            ),
+        ),
+    ),
+    Package(
+        "envpool",
+        ("envpool",),
+        ("envpool",),
+        (
+            Environment(
+                "Pendulum-v1",
+                ENVPOOL,
+                wrappers="an adapter",
+                notes=(
+                    "The simulator resets an environment by itself; the adapter gives SB3 the last observation of an episode.",
+                ),
+            ),
+        ),
+    ),
+    Package(
+        "gym-aloha",
+        ("gym-aloha", MUJOCO),
+        ("gym-aloha", "dm-control", "mujoco"),
+        (
+            Environment(
+                "gym_aloha/AlohaTransferCube-v0",
+                'import os\n\nos.environ["MUJOCO_GL"] = "egl"  # draws without a display\n\n'
+                + made("gym_aloha/AlohaTransferCube-v0", "gym_aloha", 'env_kwargs=dict(obs_type="pixels_agent_pos")'),
+                policy="MultiInputPolicy",
+                buffer_size=250,
+            ),
+        ),
+    ),
+)

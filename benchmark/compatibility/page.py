@@ -1,0 +1,158 @@
+"""The page of the tested environments, from the records of the packages."""
+
+from collections.abc import Mapping
+from statistics import mean
+from typing import Any
+
+from benchmark.common.tables import markdown_table
+from benchmark.compatibility.packages import PACKAGES, Environment, Package
+
+HEADER = ("environment", "policy, buffer, wrappers", "trains", "resumes", "exports", "steps/s", "learns")
+TOP = """\
+# Tested environments
+
+CGP on the environments of other packages. Each package is installed from PyPI into a virtual environment of its own, and each
+environment is checked there. `make test-environments` does both, and writes this page; [your own environment](environments.md)
+says what CGP needs of an environment.
+"""
+NOTES = """\
+- **trains**: 220 steps by CGP's defaults (networks of 256 and 256 units, batches of 128) but for 110 random steps and a
+  small replay buffer. The model then predicts actions within the bounds, is saved, and acts the same when it is loaded.
+- **resumes**: the same training once without a stop, and once stopped after step 163 and resumed by another process. "To the
+  bit": both end with the same networks, optimizers, replay buffer and counters. "From a new episode": the environment's state
+  cannot be restored; a warning says so, and the resumed training begins a new episode. "Differs": they differ, and
+  no warning says so.
+- **exports**: `model.export`. The number is the largest difference between the actions of `predict` and those of `policy.onnx`
+  in onnxruntime or of `load_weights`, in units of the width of the action space.
+- **steps/s**: environment steps per second of processor time, with one thread and one gradient step a step; in brackets those
+  of the environment alone, with random actions. Both are too low where the load average, which each section gives, exceeds
+  the number of cores.
+- **learns**: the mean return of 20 episodes by random actions, and by the actor after a training of so many steps, whose
+  arguments are in `benchmark/compatibility/packages.py`; and how many of these episodes ended in success, where the
+  environment reports it.
+"""
+UNKNOWN = "–"
+
+
+def page(records: Mapping[str, dict[str, Any]]) -> str:
+    """
+    Write the page.
+
+    :param records: the packages' records by name
+    :return: the page in Markdown
+    """
+    known = [package for package in PACKAGES if package.name in records]
+    rows = [row for package in known for row in _rows(package, records[package.name])]
+    sections = [_section(package, records[package.name]) for package in known]
+    missing = [package.name for package in PACKAGES if package.name not in records]
+    return "\n".join(
+        [
+            TOP,
+            markdown_table(HEADER, rows, align="left"),
+            "",
+            NOTES,
+            *([f"Not tested yet: {', '.join(missing)}.\n"] if missing else []),
+            *sections,
+        ]
+    )
+
+
+def _rows(package: Package, record: dict[str, Any]) -> list[list[str]]:
+    """Return a row for each of the package's environments."""
+    rows = []
+    for environment in package.environments:
+        found = record["environments"].get(environment.id)
+        name = f"{package.name}: {environment.id}"
+        if found is None:
+            reason = "not installed" if "failure" in record["installation"] else "not tested"
+            rows.append([name, _parts(environment), reason, *[UNKNOWN] * 4])
+        else:
+            rows.append([name, _parts(environment), *_cells(environment, found)])
+    return rows
+
+
+def _parts(environment: Environment) -> str:
+    """Return the policy, the replay buffer and the wrappers."""
+    return ", ".join(filter(None, (environment.policy, environment.replay_buffer, environment.wrappers)))
+
+
+def _cells(environment: Environment, found: dict[str, Any]) -> list[str]:
+    """Return what was found of an environment."""
+    errors = found["errors"].get("whole", {})
+    if {"starts", "trains"} & errors.keys():
+        return ["no", *[UNKNOWN] * 4]
+    failed = [name for name in ("predicts", "saves and loads") if name in errors]
+    trains = f"yes, but: {', '.join(failed)}" if failed else "yes"
+    resumes = "no" if found["resumes"] is None else found["resumes"]
+    largest = found.get("export_difference")
+    return [trains, resumes, "no" if largest is None else f"yes ({largest:.0e})", _speed(found), _learns(environment, found)]
+
+
+def _speed(found: dict[str, Any]) -> str:
+    training, alone = (found.get(f"{kind}steps_per_second") for kind in ("", "environment_"))
+    return UNKNOWN if training is None else f"{training:,.0f}" + (f" ({alone:,.0f})" if alone is not None else "")
+
+
+def _learns(environment: Environment, found: dict[str, Any]) -> str:
+    """Return the returns of random actions and of the actor."""
+    if environment.learning is None:
+        return "not tested"
+    if found.get("returns") is None:
+        return UNKNOWN
+    random, actor = (f"{mean(found[key]):.1f}" for key in ("random_returns", "returns"))
+    successes = "" if found["successes"] is None else f"; {found['random_successes']} → {found['successes']} of 20"
+    return f"{random} → {actor}{successes} ({environment.learning.steps:,} steps)"
+
+
+def _section(package: Package, record: dict[str, Any]) -> str:
+    """Return the section of a package."""
+    lines = [f"## {package.name}", "", f"`pip install {' '.join(map(_quoted, package.requirements))}`", ""]
+    installation = record["installation"]
+    if "failure" in installation:
+        lines.append(f"- It was not installed: {installation['failure']}")
+    elif not record["environments"]:
+        lines.append("- It was installed; its environments are not checked yet.")
+    else:
+        versions = ", ".join(f"{name} {record['versions'].get(name, 'missing')}" for name in package.distributions)
+        lines.append(f"- Tested: {versions}, with Python {record['python']}. {_pins(record)}")
+    lines += [f"- {note}" for note in package.notes]
+    for environment in package.environments:
+        found = record["environments"].get(environment.id, {})
+        facts = [*environment.notes, *_facts(found)]
+        lines += ["", f"{environment.id}:", "", "```py", environment.code, "```"]
+        lines += ["", *(f"- {fact}" for fact in facts)] if facts else []
+    lines += ["", _conditions(record)]
+    return "\n".join(lines) + "\n"
+
+
+def _conditions(record: dict[str, Any]) -> str:
+    """Return where the package was tested."""
+    load = "" if record.get("load_average") is None else f", load average {record['load_average']:.0f}"
+    return f"Commit {record['commit']}, on {record['machine']['cpu']}, {record['machine']['cores']} cores{load}."
+
+
+def _quoted(requirement: str) -> str:
+    """Return a requirement as a shell takes it."""
+    return f'"{requirement}"' if set("[]<>") & set(requirement) else requirement
+
+
+def _pins(record: dict[str, Any]) -> str:
+    """Return how the versions compare with those of ``constraints.txt``."""
+    if record["installation"]["pins"] == "all":
+        return "All versions are those of constraints.txt."
+    others = ", ".join(f"{name} {found} (there {pinned})" for name, (found, pinned) in record["other_versions"].items())
+    return f"The package contradicts constraints.txt. Other than there: {others or 'nothing'}."
+
+
+def _facts(found: dict[str, Any]) -> list[str]:
+    """Return what was noticed in the check, as sentences."""
+    facts = []
+    if "observations" in found:
+        facts.append(f"Observations: `{found['observations']}`; actions: `{found['actions']}`.")
+    if found.get("repeats") is False:
+        facts.append("Two trainings with one seed differ: the environment does not repeat itself.")
+    if found.get("why_not_restorable") is not None:
+        facts.append(f"Not restored: {found['why_not_restorable']}")
+    for errors in found.get("errors", {}).values():
+        facts += [f"Failed ({step}): {error}" for step, error in errors.items()]
+    return facts
