@@ -186,3 +186,45 @@ def test_what_stands_against_a_release_is_named(tag, address, file, text, fault,
         (repository / file).write_text(text)
     (found,) = FIND_FAULTS(repository, tag, address)
     assert re.search(fault, found)
+
+
+def test_the_hooks_before_a_commit_are_the_linters_of_make_lint():
+    """They run from .venv, so that there is one place for their versions: constraints.txt."""
+    config = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())
+    assert [repo["repo"] for repo in config["repos"]] == ["local"]
+    hooks = {hook["id"]: hook["entry"] for hook in config["repos"][0]["hooks"]}
+    lint = re.search(r"^lint:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)[1]
+    steps = [line.strip() for line in lint.splitlines()]
+    commands = [step.replace("$(IN_VENV)", ".venv/bin/python").replace("$(VENV)", ".venv") for step in steps]
+    # The files are named by pre-commit
+    whole = [command.removesuffix(" .") for command in commands]
+    assert [entry.replace(" --force-exclude", "") for entry in hooks.values()] == whole
+    assert {"ruff", "black", "import-linter", "mypy"} == set(hooks) <= set(pins("constraints.txt"))
+
+
+def test_the_documents_of_the_repository_link_to_files_and_goals_that_exist():
+    contributing = (ROOT / "CONTRIBUTING.md").read_text()
+    template = (ROOT / ".github" / "pull_request_template.md").read_text()
+    forms = {path.name: path.read_text() for path in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")}
+    assert set(forms) == {"bug.yml", "question.yml", "feature.yml", "config.yml"}
+    linked = re.findall(r"\]\(([^)#]+)[^)]*\)", contributing)
+    linked += [path for text in forms.values() for path in re.findall(r"\.\./blob/main/([^)]+)\)", text)]
+    assert len(linked) > 8
+    assert [path for path in linked if not (ROOT / path).exists()] == []
+    named = re.findall(r"\bmake ([a-z-]+)", contributing + template + "".join(forms.values()))
+    assert {"test", "docs", "format", "release-check"} <= set(named) <= set(GOALS)
+
+
+ANSWERS = (ROOT / "docs" / "answers.md").read_text()
+
+
+def test_every_answer_names_an_issue_of_its_project_and_a_page_here():
+    repositories = {"SB3": "DLR-RM/stable-baselines3", "rl_zoo3": "DLR-RM/rl-baselines3-zoo", "SBX": "araffin/sbx"}
+    links = re.findall(r"\[(?:(SB3|rl_zoo3|SBX)\s)?#(\d+)\]\((https://[^)]+)\)", ANSWERS)
+    assert len(links) > 20
+    project = None
+    for name, number, address in links:
+        project = name or project
+        assert re.fullmatch(rf"https://github.com/{repositories[project]}/(issues|pull)/{number}", address)
+    for answer in re.findall(r"^\*\*.*?(?=^\*\*|^## |\Z)", ANSWERS, flags=re.MULTILINE | re.DOTALL):
+        assert re.search(r"\]\([a-z_]+\.md[^)]*\)", answer), answer
