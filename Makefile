@@ -22,7 +22,11 @@ PACKAGES :=
 
 PYTHON ?= python3
 VENV := .venv
+CONSTRAINTS := constraints.txt
 IN_VENV := $(VENV)/bin/python
+# For release-check: the tag, and the address of the repository in which it was set (empty: not compared)
+TAG :=
+ADDRESS :=
 # Each test process loads PyTorch, hence the limit
 PYTEST := $(IN_VENV) -m pytest --numprocesses logical --maxprocesses 8 --durations 15
 
@@ -32,11 +36,12 @@ INSTALLED := $(STAMP)zoo
 SWEEPS_INSTALLED := $(STAMP)sweeps
 TESTS_INSTALLED := $(STAMP)tests
 DOCS_INSTALLED := $(STAMP)docs
+DIST_INSTALLED := $(STAMP)dist
 # An editable install holds copies of the version and of the start-up hook.
-REQUIREMENTS := setup.cfg pyproject.toml constraints.txt _build_backend.py sb3_cgp/version.txt
+REQUIREMENTS := setup.cfg setup.py pyproject.toml $(CONSTRAINTS) _build_backend.py sb3_cgp/version.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help train resume sweeps docs test test-slow test-environments lint format clean
+.PHONY: help train resume sweeps docs test test-quick test-slow test-oldest test-environments lint format dist release-check clean
 
 help: ## list the goals
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-17s %s\n", $$1, $$2}' Makefile
@@ -78,6 +83,12 @@ docs: $(DOCS_INSTALLED) ## install, build the documentation site into build/site
 test: lint ## install, lint and run the quick tests on all cores, with coverage
 	$(PYTEST) --dist worksteal -m "not slow" --cov --cov-report=term-missing:skip-covered --cov-fail-under=95
 
+test-quick: $(TESTS_INSTALLED) ## run the quick tests alone: no lint, no coverage
+	$(PYTEST) --dist worksteal -m "not slow"
+
+test-oldest: ## run the quick tests with the oldest versions that setup.cfg admits, in .venv-oldest: PYTHON=python3.10
+	$(MAKE) VENV=.venv-oldest CONSTRAINTS=constraints-oldest.txt test-quick
+
 test-slow: $(TESTS_INSTALLED) ## run the tests that take minutes: learning, packaging
 	$(PYTEST) --dist loadfile -m slow
 
@@ -94,8 +105,17 @@ format: $(TESTS_INSTALLED) ## reformat and correct by ruff and black
 	$(IN_VENV) -m ruff check --fix .
 	$(IN_VENV) -m black .
 
-clean: ## remove the virtual environment, build artefacts and caches; trained models stay
-	rm -rf $(VENV) build dist ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .coverage .coverage.* htmlcov
+# Without isolation, the build downloads nothing.
+dist: $(DIST_INSTALLED) ## install, build the sdist and the wheel into dist/, and check them by twine
+	rm -rf dist
+	$(IN_VENV) -m build --no-isolation
+	$(IN_VENV) -m twine check --strict dist/*
+
+release-check: ## check that TAG=v... can be released: the version, the changelog, the repository's address
+	$(PYTHON) .github/check_release.py "$(TAG)" $(if $(ADDRESS),--address "$(ADDRESS)")
+
+clean: ## remove the virtual environments, build artefacts and caches; trained models stay
+	rm -rf $(VENV) .venv-oldest build dist ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .coverage .coverage.* htmlcov
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp is removed before an installation and made after it: without one, the environment is created anew.
@@ -106,11 +126,11 @@ $(INSTALLED): $(REQUIREMENTS)
 	  echo "Name a newer one, as in: make PYTHON=python3.12 $(or $(MAKECMDGOALS),train)" >&2; exit 1; }
 	test -e $@ || $(PYTHON) -m venv --clear $(VENV)
 	rm -f $(STAMP)*
-	$(IN_VENV) -m pip install -c constraints.txt -e ".[zoo]"
+	$(IN_VENV) -m pip install -c $(CONSTRAINTS) -e ".[zoo]"
 	touch $@
 
 # All stamps are touched, because an extra installed earlier is still installed.
-$(SWEEPS_INSTALLED) $(DOCS_INSTALLED) $(TESTS_INSTALLED): $(STAMP)%: $(INSTALLED)
+$(SWEEPS_INSTALLED) $(DOCS_INSTALLED) $(DIST_INSTALLED) $(TESTS_INSTALLED): $(STAMP)%: $(INSTALLED)
 	rm -f $(INSTALLED)
-	$(IN_VENV) -m pip install -c constraints.txt -e ".[$*]"
+	$(IN_VENV) -m pip install -c $(CONSTRAINTS) -e ".[$*]"
 	touch $(INSTALLED) $(filter-out $(INSTALLED),$@ $(wildcard $(STAMP)*))

@@ -1,16 +1,20 @@
-"""The build backend: that of setuptools, with additional files in the wheel.
+"""The build backend: that of setuptools, with additional files in the wheel, and with a description for PyPI.
 
 Every wheel, also that of an editable install, contains the start-up hook ``_sb3_cgp_zoo`` and the two files that call it at
 the start of Python. setuptools installs neither ``.pth`` nor ``.start`` files, and its commands could be extended only by
 their private classes. An editable install contains a copy of the hook, too: the copy is compiled, and it remains if the
 checkout is moved. A regular wheel also contains ``hyperparams/``, which an editable install reads from the checkout.
+
+``setup.py`` takes the description from here: README's links to files of the repository do not work on PyPI.
 """
 
 import base64
+import configparser
 import csv
 import hashlib
 import io
 import os
+import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -44,6 +48,15 @@ STARTUP_LINES = {
     "sb3_cgp.pth": r'import sys; exec("try:\n import _sb3_cgp_zoo\n _sb3_cgp_zoo.install()\nexcept Exception:\n pass")' "\n",
     "sb3_cgp.start": "_sb3_cgp_zoo:install\n",
 }
+
+# Code, in which brackets are no links
+CODE = re.compile(r"(```.*?```|`[^`\n]*`)", re.DOTALL)
+# The targets of links and images that are relative, in Markdown and in HTML; "#part" is within the page.
+RELATIVE = re.compile(
+    r"""(?P<before>\]\(|^\[[^\]]+\]:\s+|\b(?:src|srcset|href)=")(?!\#|//|[a-z][a-z\d+.-]*:)(?P<path>[^\s)"]+)""",
+    re.IGNORECASE | re.MULTILINE,
+)
+PICTURES = (".gif", ".jpg", ".jpeg", ".png", ".svg", ".webp")
 
 
 def build_wheel(wheel_directory: str, config_settings: Any = None, metadata_directory: str | None = None) -> str:
@@ -122,3 +135,54 @@ def add_files(wheel: Path, files: Mapping[str, str]) -> None:
         for member, content in members.items():
             archive.writestr(member, content, compress_type=zipfile.ZIP_DEFLATED)
     os.replace(rewritten, wheel)
+
+
+def repository() -> str:
+    """
+    Return the address of the repository from ``setup.cfg``, without a slash at its end.
+
+    :return: the address, empty if none is set
+    """
+    settings = configparser.ConfigParser()
+    settings.read("setup.cfg", encoding="utf-8")
+    return settings.get("repository", "address", fallback="").strip().rstrip("/")
+
+
+def describe(readme: str, address: str, version: str) -> str:
+    """
+    Return the description for PyPI: README, with relative links made absolute, to the files of the version's tag.
+
+    :param readme: the text of README.md
+    :param address: the address of the repository; README is returned unchanged if it is empty
+    :param version: the version, whose tag is ``v`` and the version
+    :return: the description, in Markdown
+    """
+
+    def absolute(found: re.Match[str]) -> str:
+        kind = "raw" if found["path"].partition("#")[0].lower().endswith(PICTURES) else "blob"
+        return f"{found['before']}{address}/{kind}/v{version}/{found['path'].removeprefix('./')}"
+
+    if not address:
+        return readme
+    # Parts at odd places are code
+    parts = CODE.split(readme)
+    parts[::2] = [RELATIVE.sub(absolute, part) for part in parts[::2]]
+    return "".join(parts)
+
+
+def link_to(address: str, version: str) -> dict[str, str]:
+    """
+    Return the links that PyPI shows beside the description.
+
+    :param address: the address of the repository, empty if none is set
+    :param version: the version, whose tag is ``v`` and the version
+    :return: addresses by name, none if the repository has no address
+    """
+    if not address:
+        return {}
+    return {
+        "Source": address,
+        "Documentation": f"{address}/blob/v{version}/docs/index.md",
+        "Changelog": f"{address}/blob/v{version}/CHANGELOG.md",
+        "Questions and bugs": f"{address}/issues",
+    }

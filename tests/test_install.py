@@ -25,8 +25,17 @@ from packaging.utils import canonicalize_name
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
-SOURCES = ["sb3_cgp", "hyperparams", "_build_backend.py", "_sb3_cgp_zoo.py", "setup.cfg", "pyproject.toml", "MANIFEST.in"]
-DOCUMENTS = ["README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "Makefile", "constraints.txt"]
+SOURCES = ["sb3_cgp", "hyperparams", "_build_backend.py", "_sb3_cgp_zoo.py", "setup.cfg", "setup.py", "pyproject.toml"]
+DOCUMENTS = [
+    "MANIFEST.in",
+    "README.md",
+    "LICENSE",
+    "CHANGELOG.md",
+    "CITATION.cff",
+    "CONTRIBUTING.md",
+    "Makefile",
+    "constraints.txt",
+]
 QUICK = ["learning_starts:100", "batch_size:8", "cem_samples:8", "buffer_size:1000"]
 RUN = ["--algo", "cgp", "--env", "Pendulum-v1", "-f", "logs"]
 

@@ -1,6 +1,7 @@
 """The Makefile's set-up, with a stand-in for Python that installs nothing and notes what it was asked."""
 
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -8,7 +9,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-REQUIREMENTS = ("setup.cfg", "pyproject.toml", "constraints.txt", "_build_backend.py", "sb3_cgp/version.txt")
+REQUIREMENTS = ("setup.cfg", "setup.py", "pyproject.toml", "constraints.txt", "_build_backend.py", "sb3_cgp/version.txt")
+FILES = ("Makefile", "constraints-oldest.txt", *REQUIREMENTS)
 
 pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
 
@@ -25,8 +27,9 @@ case "$*" in
   --version) echo "Python 3.9.1" ;;
   "-c import sys"*) [ -z "$OLD" ] ;;
   "-m venv"*)
-    mkdir -p .venv/bin
-    for program in python lint-imports; do cp "$0" .venv/bin/$program && chmod +x .venv/bin/$program; done ;;
+    for last; do :; done
+    mkdir -p $last/bin
+    for program in python lint-imports; do cp "$0" $last/bin/$program && chmod +x $last/bin/$program; done ;;
   "-m benchmark.plan"*) echo "250 4 $WARM_UP" ;;
   *"$FAIL"*) [ -z "$FAIL" ] ;;
 esac
@@ -38,7 +41,7 @@ class Clone:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "a fresh clone"
-        for name in ("Makefile", *REQUIREMENTS):
+        for name in FILES:
             (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, self.folder / name)
         self.python = folder / "python"
@@ -241,8 +244,63 @@ def test_environments_of_other_packages_are_named(clone: Clone) -> None:
 def test_help_is_the_default_and_lists_every_goal(clone: Clone) -> None:
     calls, ended = clone.make()
     assert not calls
-    for goal in ("train", "resume", "sweeps", "docs", "test", "test-slow", "test-environments", "lint", "format", "clean"):
+    goals = re.findall(r"^([a-z-]+):", (clone.folder / "Makefile").read_text(), flags=re.MULTILINE)
+    assert {"train", "docs", "test", "test-oldest", "dist", "release-check", "clean"} <= set(goals)
+    for goal in goals:
         assert f"make {goal} " in ended.stdout
+    phony = re.search(r"^\.PHONY: (.*)$", (clone.folder / "Makefile").read_text(), flags=re.MULTILINE)
+    assert sorted(phony[1].split()) == sorted(goals)
+
+
+def test_what_make_creates_is_ignored_by_git_and_removed_by_clean(clone: Clone) -> None:
+    """Trained agents and results are ignored, too, and stay."""
+    ignored = (ROOT / ".gitignore").read_text().splitlines()
+    created = (".venv", ".venv-oldest", "build", "dist", ".pytest_cache", ".mypy_cache", ".ruff_cache", ".import_linter_cache")
+    for name in (*created, "htmlcov", "package.egg-info", "sb3_cgp/__pycache__"):
+        (clone.folder / name).mkdir(parents=True)
+        pattern = f"*{Path(name).suffix}" if name.endswith(".egg-info") else Path(name).name
+        assert f"{pattern}/" in ignored
+    (clone.folder / ".coverage").touch()
+    assert ".coverage" in ignored
+    for name in ("logs", "results"):
+        (clone.folder / name).mkdir()
+        assert {f"{name}/", f"/{name}/"} & set(ignored)
+    _, ended = clone.make("clean")
+    assert ended.returncode == 0, ended.stderr
+    left = {path.name for path in clone.folder.iterdir()}
+    assert left == {Path(name).parts[0] for name in FILES} | {
+        "logs",
+        "results",
+    }
+
+
+def test_the_oldest_versions_have_an_environment_of_their_own(clone: Clone) -> None:
+    calls, ended = clone.make("test-oldest")
+    assert ended.returncode == 0, ended.stderr
+    assert starting(calls, "-m venv") == ["-m venv --clear .venv-oldest"]
+    assert starting(calls, "-m pip") == [
+        "-m pip install -c constraints-oldest.txt -e .[zoo]",
+        "-m pip install -c constraints-oldest.txt -e .[tests]",
+    ]
+    assert calls[-1].startswith("-m pytest")
+    assert not (clone.folder / ".venv").exists()
+
+
+def test_what_is_built_is_checked(clone: Clone) -> None:
+    (clone.folder / "dist").mkdir()
+    (clone.folder / "dist" / "sb3_cgp-0.0.9.tar.gz").touch()
+    calls, ended = clone.make("dist")
+    assert ended.returncode == 0, ended.stderr
+    assert calls[-2:] == ["-m build --no-isolation", "-m twine check --strict dist/*"]
+    assert not (clone.folder / "dist").exists()
+    _, ended = clone.make("dist", FAIL="twine check")
+    assert ended.returncode != 0
+
+
+def test_a_release_is_checked_with_the_tag_and_the_address(clone: Clone) -> None:
+    calls, _ = clone.make("release-check", "TAG=v1", "ADDRESS=https://example.org/a b")
+    assert calls == [".github/check_release.py v1 --address <https://example.org/a b>"]
+    assert clone.make("release-check", "TAG=v1")[0] == [".github/check_release.py v1"]
 
 
 def test_clean_leaves_the_trained_models(clone: Clone) -> None:
