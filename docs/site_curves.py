@@ -6,6 +6,7 @@ from pathlib import Path
 import plotly
 from sphinx.application import Sphinx
 
+from benchmark.common.records import RUNS
 from benchmark.reporting.figures import study_folders
 from benchmark.reporting.interactive import figure
 from benchmark.reporting.scores import Study, read_study
@@ -36,6 +37,9 @@ def fill(app: Sphinx, docname: str, source: list[str]) -> None:
     if docname != PAGE:
         return
     studies = [read_study(folder) for folder in study_folders(Path(app.srcdir) / SWEEPS)]
+    for study in studies:
+        # So that the page is built anew when runs have ended
+        app.env.note_dependency(str(study.folder / RUNS))
     learning = [(study, task) for study in studies if not study.axes for task in study.tasks]
     figures = [figure_in_words(study, task, f"figure-{number}") for number, (study, task) in enumerate(learning)]
     records = "\n".join(
