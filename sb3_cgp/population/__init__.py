@@ -28,5 +28,12 @@ The gradient step does not synchronize with the host, and changes its state in p
 
 from sb3_cgp.population.algorithm import Population
 from sb3_cgp.population.callbacks import PopulationEvalCallback, evaluate_population
+from sb3_cgp.population.environments import ChunkedSubprocVecEnv, make_population_env
 
-__all__ = ["Population", "PopulationEvalCallback", "evaluate_population"]
+__all__ = [
+    "ChunkedSubprocVecEnv",
+    "Population",
+    "PopulationEvalCallback",
+    "evaluate_population",
+    "make_population_env",
+]
