@@ -25,6 +25,8 @@ from sb3_cgp.common.files import write_atomically
 from sb3_cgp.population.environments import available_cores
 
 RECORDED = ("env", "seed", "rounds", "steps", "processes")
+# The exit code where the time is over before the last point
+TIME_OVER = 3
 NUMBERS = [1, 4, 8, 16, 32, 64]
 
 
@@ -132,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             continue
         if args.minutes is not None and time.monotonic() - start > 60 * args.minutes:
             print("The time is over. The same command continues.")
-            break
+            sys.exit(TIME_OVER)
         point = measure_point(method, n_agents, args)
         record["points"].append(point)
         publish(args, record)
