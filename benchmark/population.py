@@ -124,7 +124,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     th.set_num_threads(args.threads)
     record = conditions("benchmark.population", argv, args.device) | {name: getattr(args, name) for name in RECORDED}
     record["points"] = kept_points(args, record)
-    record["product_rate"] = measure_product_rate(args.device)
+    if not args.only_estimate:
+        record["product_rate"] = measure_product_rate(args.device)
     if args.estimate:
         record["estimates"] = estimate_all(args.methods, args.numbers)
         publish(args, record)
