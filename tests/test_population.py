@@ -678,6 +678,8 @@ def test_recorded_gradient_steps_are_the_ordinary_ones(variant, monkeypatch):
     monkeypatch.setattr(StandIn, "made", 0)
     recorded = make(AGENTS, **VARIANTS[variant]).learn(3 * 80)
     assert StandIn.made > 0
+    # Acting, too
+    assert None in {due for due, *_ in recorded._recorded}
     assert not any(each._stays_eager for each in recorded._recorded.values())
     for name, value in ordinary.policy.state_dict().items():
         assert th.equal(recorded.policy.state_dict()[name], value), name

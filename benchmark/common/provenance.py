@@ -24,6 +24,7 @@ PACKAGES = (
     "jax",
     "gymnasium",
     "mujoco",
+    "envpool",
     "numpy",
 )
 

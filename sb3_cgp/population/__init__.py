@@ -7,7 +7,7 @@ agents, so that N agents share what it costs to start them.
 ==========================  ==================================================================================================
 part                        how it is made for N agents
 ==========================  ==================================================================================================
-environments                one ``VecEnv`` of N environments; environment i belongs to agent i
+environments                one ``VecEnv`` of N environments, in a few processes; environment i belongs to agent i
 replay buffer               one of SB3's, of N environments; agent i samples column i (``replay.py``)
 networks                    one network whose parameters have an axis of agents, multiplied by ``baddbmm`` (``networks.py``)
 action selector             one call for N B states, with one random generator; the selector is not changed (``policies.py``)
@@ -23,10 +23,18 @@ they are to the bit, and the other agents do not notice.
 Agent i begins with the networks and the environment that a CGP alone has with its seed. Given the same minibatches and random
 numbers, it computes what that CGP computes. In a population, all agents draw from one generator.
 
-The gradient step does not synchronize with the host, and changes its state in place: on a GPU it is a CUDA graph.
+The gradient step does not synchronize with the host, and changes its state in place: on a GPU it is a CUDA graph, and
+so is the selection of actions in a rollout.
 """
 
 from sb3_cgp.population.algorithm import Population
 from sb3_cgp.population.callbacks import PopulationEvalCallback, evaluate_population
+from sb3_cgp.population.environments import ChunkedSubprocVecEnv, make_population_env
 
-__all__ = ["Population", "PopulationEvalCallback", "evaluate_population"]
+__all__ = [
+    "ChunkedSubprocVecEnv",
+    "Population",
+    "PopulationEvalCallback",
+    "evaluate_population",
+    "make_population_env",
+]

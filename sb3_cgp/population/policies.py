@@ -22,6 +22,9 @@ from sb3_cgp.population.adam import AgentAdam
 from sb3_cgp.population.networks import StackedMLP, agent_slices
 from sb3_cgp.selectors.proposals import takes_proposals
 
+# Returns the actions that agents take at their observations, (N, *shape)
+Selection = Callable[[th.Tensor], th.Tensor]
+
 
 class PopulationPolicy(BasePolicy):
     """
@@ -39,6 +42,8 @@ class PopulationPolicy(BasePolicy):
     actor_optimizer: AgentAdam
     critic_optimizer: AgentAdam
     failed_at: th.Tensor
+    # Carries a selection of actions out, as a CUDA graph while a population is trained; None for an ordinary call
+    recorded_selection: Callable[[Selection, th.Tensor], th.Tensor] | None = None
 
     def __init__(self, observation_space: spaces.Box, action_space: spaces.Box, agents: Sequence[CGP]):
         super().__init__(observation_space, action_space, squash_output=True)
@@ -117,12 +122,16 @@ class PopulationPolicy(BasePolicy):
         n_rows = observation.shape[0]
         allowed = f"of {self.n_agents} rows, one for each agent: `population[i]` acts on the observations of agent i alone"
         require(n_rows == self.n_agents, "observation", f"{n_rows} rows", allowed)
-        features = self.features(observation.unsqueeze(1))
         if self.inference == "cem":
-            return self.select_actions(features).squeeze(1)
+            recorded = self.recorded_selection
+            return self._select(observation) if recorded is None else recorded(self._select, observation)
         actors = self.averaged_actors if self.inference == "averaged_actor" else self.actors
-        actions: th.Tensor = actors(features)[0].squeeze(1)
+        actions: th.Tensor = actors(self.features(observation.unsqueeze(1)))[0].squeeze(1)
         return actions
+
+    def _select(self, observation: th.Tensor) -> th.Tensor:
+        """Select each agent's action, (N, A), at its observation."""
+        return self.select_actions(self.features(observation.unsqueeze(1))).squeeze(1)
 
     def _pairs(self, agent: CGP) -> Iterator[tuple[StackedMLP, nn.Module]]:
         """List the stacked networks, each with the same network of an agent."""

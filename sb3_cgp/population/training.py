@@ -1,7 +1,7 @@
 """The training of a population: acting, gradient steps, failures and the log, within SB3's loop."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from sb3_cgp.guards.transitions import TransitionGuard
 from sb3_cgp.guards.workers import WorkerGuard
 from sb3_cgp.population.agents import Arguments
 from sb3_cgp.population.gradient_step import AgentNumbers, GradientStep
-from sb3_cgp.population.policies import PopulationPolicy
+from sb3_cgp.population.policies import PopulationPolicy, Selection
 from sb3_cgp.population.replay import sample_columns
 
 # Gradient steps between two checks of the losses on a GPU, each of which synchronizes with it
@@ -84,8 +84,12 @@ class PopulationTraining(
             actions[:] = [self.action_space.sample() for _ in range(n_envs)]
         if not is_random.all():
             assert self._last_obs is not None
-            with self.policy.acting_by("cem"):
-                selected, _ = self.predict(self._last_obs)
+            self.policy.recorded_selection = self._select_actions
+            try:
+                with self.policy.acting_by("cem"):
+                    selected, _ = self.predict(self._last_obs)
+            finally:
+                self.policy.recorded_selection = None
             actions[~is_random] = selected[~is_random]
         scaled = self.policy.scale_action(actions)
         if action_noise is not None:
@@ -137,12 +141,31 @@ class PopulationTraining(
     def _carry_out(self, due: tuple[bool, bool], inputs: Sequence[th.Tensor]) -> Tensors:
         """Carry a gradient step out, as a CUDA graph where possible: one for each combination of what is due."""
         step = GradientStep(self.policy, self._numbers, self._policy_loss, *due)
-        if not (self.cuda_graphs and has_cuda_graphs(self.device)):
+        if not self._records_steps:
             return step(*inputs)
-        fixed = (*due, repr(self.policy.selector), self.policy.actor_proposes)
+        return self._recorded_function(due, lambda: [*self.policy.parameters(), *self.policy.buffers()])(step, *inputs)
+
+    def _select_actions(self, select: Selection, observation: th.Tensor) -> th.Tensor:
+        """Select actions in a rollout, as a CUDA graph where possible."""
+        if not self._records_steps:
+            return select(observation)
+        # Selecting actions changes no tensor
+        (actions,) = self._recorded_function(None, list)(lambda observation: (select(observation),), observation)
+        assert actions is not None
+        return actions
+
+    @property
+    def _records_steps(self) -> bool:
+        return self.cuda_graphs and has_cuda_graphs(self.device)
+
+    def _recorded_function(
+        self, due: tuple[bool, bool] | None, list_state: Callable[[], Sequence[th.Tensor]]
+    ) -> RecordedFunction:
+        """Return the recorded function of a gradient step, or of acting, None; a new one for another selector."""
+        fixed = (due, repr(self.policy.selector), self.policy.actor_proposes)
         if fixed not in self._recorded:
-            self._recorded[fixed] = RecordedFunction(lambda: [*self.policy.parameters(), *self.policy.buffers()])
-        return self._recorded[fixed](step, *inputs)
+            self._recorded[fixed] = RecordedFunction(list_state)
+        return self._recorded[fixed]
 
     def _report_failures(self) -> None:
         """

@@ -1,0 +1,239 @@
+"""
+Do, on a GPU that is there for a short time, what is worth most first: the tests that need one, the speed of populations, and
+the paper's sweeps as populations.
+
+``python -m benchmark.gpu_list --minutes 9`` ends within nine minutes. The same command continues: steps that are done are
+skipped, and a stopped one goes on from what it has written. ``--rehearse`` does all of it on the CPU, with tiny sizes.
+"""
+
+import argparse
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from benchmark.common.arguments import add_epilog, count, output_folder
+from benchmark.common.files import write_json
+
+ROOT = Path(__file__).parents[1]
+TESTS = ("cuda_graphs", "device_replay", "population", "resume", "parity", "learning")
+# Sweeps on HalfCheetah-v5 in the order of their value, and e1 on its other tasks
+SWEEPS = ("e6", "e4", "e7", "e8", "e3", "e1")
+OTHER_TASKS = ("Humanoid-v5", "Hopper-v5", "Pusher-v5", "Ant-v5")
+LIGHT = "CGP-Light"
+# Taken where a sweep's file has them; CGP-Light is added to all
+METHODS = ("CGP-Online", LIGHT, "TD3")
+# Further ones of e3, which compares the variants
+VARIANTS = ("QGP-Online", "CGP-Offline", "QGP-Offline")
+# Of a rehearsal
+TINY = (
+    *("--device", "cpu", "--env", "Pendulum-v1", "--numbers", "1", "2", "--methods", "TD3", "--no-estimate"),
+    *("--rounds", "1", "--steps", "2", "--processes", "1"),
+)
+TINY_SWEEP = ("--seeds", "1", "--eval-episodes", "1", "--set", "policy_kwargs=dict(net_arch=[8,8])")
+# Seconds that a step is given to save its state and to end
+TO_END = 45.0
+# States of a step in the list's record
+DONE, FAILED, STOPPED = "done", "failed", "stopped"
+# The exit code of a command that has reached its time limit
+TIME_OVER = 3
+
+Execute = Callable[[Sequence[str], Path, float], int]
+
+
+@dataclass(frozen=True)
+class Step:
+    """
+    A step of the list.
+
+    :param name: its name, and that of its log
+    :param command: the command line, after Python's name
+    :param takes_minutes: whether the command has the option ``--minutes``
+    """
+
+    name: str
+    command: tuple[str, ...]
+    takes_minutes: bool = False
+
+
+def parse(argv: Sequence[str]) -> argparse.Namespace:
+    """
+    Read the command line.
+
+    :param argv: the arguments
+    :return: the parsed arguments
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmark.gpu_list", description="Do what is worth most on a GPU that is there for a short time."
+    )
+    parser.add_argument("--minutes", type=float, help="end within this time (default: no limit)")
+    parser.add_argument("--steps", type=count, default=300_000, help="environment steps of each run (default: %(default)s)")
+    parser.add_argument("--population", type=count, default=32, help="runs of one process at a time (default: %(default)s)")
+    parser.add_argument("--workers", type=count, default=1, help="processes of each sweep (default: %(default)s)")
+    parser.add_argument("--folder", type=output_folder, default="results/gpu_list", help="folder (default: %(default)s)")
+    parser.add_argument("--only", nargs="+", help="names of steps to do (default: all)")
+    parser.add_argument("--retry", action="store_true", help="do steps again that have failed")
+    parser.add_argument("--rehearse", action="store_true", help="do all of it on the CPU, with tiny sizes")
+    parser.add_argument("--list", action="store_true", help="print the steps and their states, and do nothing")
+    add_epilog(
+        parser,
+        "examples:\n  python -m benchmark.gpu_list --minutes 9\n  python -m benchmark.gpu_list --rehearse --folder rehearsal",
+        "The same command continues. Logs, results, and the list's own record, gpu_list.json, are written to --folder.",
+    )
+    return parser.parse_args(argv)
+
+
+def list_steps(args: argparse.Namespace) -> list[Step]:
+    """
+    List the steps, the most valuable first.
+
+    :param args: the command line
+    :return: the steps
+    """
+    python = (sys.executable, "-m")
+    files = [f"tests/test_{name}.py" for name in TESTS]
+    # The tests with "graphs" in their names have a stand-in for a GPU
+    which = "recorded_gradient_steps" if args.rehearse else "gpu or graphs"
+    tests = (*python, "pytest", "-q", "-p", "no:cacheprovider", *(files[2:3] if args.rehearse else files), "-k", which)
+    sizes = TINY if args.rehearse else ("--device", "cuda")
+    population = (*python, "benchmark.population", "--folder", str(args.folder / "population"), *sizes)
+    return [
+        Step("tests", tests),
+        Step("population", population, takes_minutes=True),
+        *(Step(name, (*python, "benchmark.sweep", *sweep_options(name, args))) for name in SWEEPS),
+    ]
+
+
+def sweep_options(name: str, args: argparse.Namespace) -> list[str]:
+    """
+    Return the arguments of a sweep, and write its file, which is the paper's with CGP-Light.
+
+    :param name: the sweep
+    :param args: the command line
+    :return: the arguments
+    """
+    content = yaml.safe_load((ROOT / "hyperparams" / "sweeps" / f"{name}.yml").read_text())
+    content["methods"] = list(dict.fromkeys([*content["methods"], LIGHT]))
+    wanted = (*METHODS, *VARIANTS) if name == "e3" else METHODS
+    methods = [method for method in wanted if method in content["methods"]]
+    tasks, steps, device = list(content["tasks"]), args.steps, "cuda"
+    further: Sequence[str] = ()
+    if name == "e1":
+        tasks = list(OTHER_TASKS)
+    if args.rehearse:
+        methods, tasks, steps, device, further = ["CGP-Online", LIGHT], ["Pendulum-v1"], 40, "cpu", TINY_SWEEP
+    folder = args.folder / "sweeps"
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"{name}.yml"
+    file.write_text(yaml.safe_dump(content, sort_keys=False))
+    return [
+        *(str(file), "--study", name, "--task", *tasks, "--steps", str(steps), "--methods", *methods, *further),
+        *("--population", str(args.population), "--device", device, "--workers", str(args.workers)),
+        *(
+            "--storage",
+            f"sqlite:///{folder / 'studies.db'}",
+            "--logs",
+            str(folder / "logs"),
+            "--results",
+            str(folder / "results"),
+        ),
+    ]
+
+
+def execute(command: Sequence[str], log: Path, seconds: float) -> int:
+    """
+    Execute a command for a time, after which it is asked to end, and then ended.
+
+    :param command: the command line
+    :param log: the file that its output is appended to
+    :param seconds: the time
+    :return: its exit code, :data:`TIME_OVER` if it was stopped
+    """
+    with log.open("ab") as output:
+        process = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
+        try:
+            return process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            # A sweep saves its runs' states
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(TO_END)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            return TIME_OVER
+        except BaseException:
+            process.terminate()
+            process.wait()
+            raise
+
+
+def do_steps(steps: Sequence[Step], args: argparse.Namespace, execute: Execute = execute) -> dict[str, Any]:
+    """
+    Do the steps that are left, in order, until the time is over. The record is written after each of them.
+
+    :param steps: the steps
+    :param args: the command line
+    :param execute: executes a command: the command line, the log, and the seconds that it may take
+    :return: the record: state, seconds and exit code of each step that was begun
+    """
+    start = time.monotonic()
+    limit = float("inf") if args.minutes is None else 60 * args.minutes - TO_END
+    path = args.folder / "gpu_list.json"
+    record: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    for step in steps:
+        state = record.get(step.name, {}).get("state")
+        if state == DONE or (state == FAILED and not args.retry) or (args.only is not None and step.name not in args.only):
+            print(f"{step.name}: {state or 'left out'}", flush=True)
+            continue
+        begin = time.monotonic()
+        left = limit - (begin - start)
+        if left <= 0:
+            print("The time is over. The same command continues.")
+            break
+        command = list(step.command)
+        if step.takes_minutes and args.minutes is not None:
+            # Half a minute less, as a point that has begun is finished
+            command += ["--minutes", f"{max(left / 60 - 0.5, 0.0):.2f}"]
+        print(f"{step.name}: {' '.join(command[1:])}", flush=True)
+        code = execute(command, args.folder / f"{step.name}.log", left)
+        state = DONE if code == 0 else STOPPED if code == TIME_OVER else FAILED
+        seconds = record.get(step.name, {}).get("seconds", 0.0) + time.monotonic() - begin
+        record[step.name] = {"state": state, "seconds": round(seconds, 1), "exit_code": code, "command": command[1:]}
+        write_json(path, record)
+        print(f"{step.name}: {state} after {seconds:.0f} s, see {args.folder / step.name}.log", flush=True)
+    return record
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """
+    Do the list.
+
+    :param argv: the command line; None for that of the process
+    """
+    args = parse(sys.argv[1:] if argv is None else argv)
+    args.folder = args.folder.absolute()
+    steps = list_steps(args)
+    unknown = sorted(set(args.only or []) - {step.name for step in steps})
+    if unknown:
+        sys.exit(f"Error: --only {' '.join(unknown)}: must be of {', '.join(step.name for step in steps)}")
+    if args.list:
+        path = args.folder / "gpu_list.json"
+        record = json.loads(path.read_text()) if path.exists() else {}
+        for step in steps:
+            print(f"{step.name}: {record.get(step.name, {}).get('state', 'to do')}: {' '.join(step.command[1:])}")
+        return
+    record = do_steps(steps, args)
+    if any(entry["state"] == FAILED for entry in record.values()):
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

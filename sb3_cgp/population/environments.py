@@ -1,0 +1,298 @@
+"""Environments of a population: a few processes, each of which steps several environments."""
+
+import multiprocessing as mp
+import os
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+from sb3_cgp.common.rules import require, require_count
+from sb3_cgp.resumption.environments import RestorableEnv
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def make_population_env(
+    env_id: str | Callable[..., gym.Env],
+    n_agents: int,
+    n_processes: int | None = None,
+    seed: int | None = None,
+    wrapper_class: Callable[[gym.Env], gym.Env] | None = None,
+    wrapper_kwargs: dict[str, Any] | None = None,
+    start_method: str | None = None,
+    **kwargs: Any,
+) -> VecEnv:
+    """
+    Make the environments of a population, as SB3's ``make_vec_env`` does, in processes that step several of them each.
+
+    They can be restored: :class:`~sb3_cgp.RestorableEnv` is the outermost wrapper of each.
+
+    :param env_id: either the env ID, the env class or a callable returning an env
+    :param n_agents: number of environments, one for each agent
+    :param n_processes: number of processes, at most ``n_agents``; 1 for a ``DummyVecEnv``, which steps them in this process;
+        None for one process for each core that this process may use
+    :param seed: the seed of the first environment; those of the next ones count from it
+    :param wrapper_class: a wrapper, or a function that wraps an environment
+    :param wrapper_kwargs: the wrapper's keyword arguments
+    :param start_method: how processes are started, see :class:`ChunkedSubprocVecEnv`
+    :param kwargs: the further arguments of ``make_vec_env``, such as ``env_kwargs``
+    :return: the environments
+    :raises ValueError: if a number is out of its range
+    """
+    require_count("n_agents", n_agents)
+    if n_processes is None:
+        n_processes = min(available_cores(), n_agents)
+    check_processes(n_processes, n_agents)
+
+    def wrap(env: gym.Env) -> gym.Env:
+        return RestorableEnv(env if wrapper_class is None else wrapper_class(env, **(wrapper_kwargs or {})))
+
+    in_processes: dict[str, Any] = {}
+    if n_processes > 1:
+        chunks = {"n_processes": n_processes, "start_method": start_method}
+        in_processes = {"vec_env_cls": ChunkedSubprocVecEnv, "vec_env_kwargs": chunks}
+    return make_vec_env(env_id, n_agents, seed, wrapper_class=wrap, **in_processes, **kwargs)
+
+
+def check_processes(n_processes: int, n_envs: int) -> None:
+    """
+    Check a number of processes.
+
+    :param n_processes: number of processes
+    :param n_envs: number of environments
+    :raises ValueError: if it is out of its range
+    """
+    require_count("n_processes", n_processes)
+    require(n_processes <= n_envs, "n_processes", n_processes, f"at most {n_envs}, the number of environments")
+
+
+def chunk_bounds(n_envs: int, n_processes: int) -> list[tuple[int, int]]:
+    """
+    Share environments out among processes, in order, as evenly as possible.
+
+    :param n_envs: number of environments
+    :param n_processes: number of processes
+    :return: the first environment of each process, and the first one of the next process
+    """
+    return [(index * n_envs // n_processes, (index + 1) * n_envs // n_processes) for index in range(n_processes)]
+
+
+class ChunkedSubprocVecEnv(SubprocVecEnv):
+    """
+    Environments in a few processes, each of which steps several of them one after the other, by a ``DummyVecEnv``.
+
+    SB3's ``SubprocVecEnv`` has one process for each environment: with more of them than cores, most of a step is spent in
+    switching between processes and in one message for each environment. This one sends a message for each process. What it
+    returns is what a ``DummyVecEnv`` of the same environments returns, to the bit. It is a ``SubprocVecEnv``, so that what
+    deals with processes that die and with saved states deals with it too.
+
+    :param env_fns: functions that make the environments
+    :param n_processes: number of processes, at most as many as environments; None for one for each available core
+    :param start_method: "forkserver", "spawn" or "fork", see SB3's ``SubprocVecEnv``
+    :raises ValueError: if the number of processes is out of its range
+    """
+
+    def __init__(
+        self, env_fns: Sequence[Callable[[], gym.Env]], n_processes: int | None = None, start_method: str | None = None
+    ):
+        # Not SubprocVecEnv's constructor, which starts a process for each environment
+        n_envs = len(env_fns)
+        n_processes = min(available_cores(), n_envs) if n_processes is None else n_processes
+        check_processes(n_processes, n_envs)
+        self.waiting = self.closed = False
+        self._bounds = chunk_bounds(n_envs, n_processes)
+        # SB3's choice
+        start_method = start_method or ("forkserver" if "forkserver" in mp.get_all_start_methods() else "spawn")
+        context: Any = mp.get_context(start_method)
+        self.remotes, self.work_remotes = zip(*[context.Pipe() for _ in self._bounds], strict=True)
+        self.processes = []
+        for (start, stop), remote, work_remote in zip(self._bounds, self.remotes, self.work_remotes, strict=True):
+            arguments = (work_remote, remote, CloudpickleWrapper(list(env_fns[start:stop])))
+            # A daemon ends with the main process
+            process = context.Process(target=_step_chunk, args=arguments, daemon=True)
+            process.start()
+            self.processes.append(process)
+            work_remote.close()
+        self.remotes[0].send(("get_spaces", None))
+        VecEnv.__init__(self, n_envs, *self.remotes[0].recv())
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """
+        Tell the environments to take a step.
+
+        :param actions: an action of each environment
+        """
+        for (start, stop), remote in zip(self._bounds, self.remotes, strict=True):
+            remote.send(("step", actions[start:stop]))
+        self.waiting = True
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        Wait for the step.
+
+        :return: observations, rewards, ends of episodes and infos
+        """
+        observations, rewards, dones, infos, reset_infos = zip(*[remote.recv() for remote in self.remotes], strict=True)
+        self.waiting = False
+        self.reset_infos = _join(reset_infos)
+        return _concatenate(observations), np.concatenate(rewards), np.concatenate(dones), _join(infos)
+
+    def reset(self) -> VecEnvObs:
+        """
+        Reset the environments.
+
+        :return: observations
+        """
+        for (start, stop), remote in zip(self._bounds, self.remotes, strict=True):
+            remote.send(("reset", (self._seeds[start:stop], self._options[start:stop])))
+        observations, reset_infos = zip(*[remote.recv() for remote in self.remotes], strict=True)
+        self.reset_infos = _join(reset_infos)
+        self._reset_seeds()
+        self._reset_options()
+        return _concatenate(observations)
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """
+        Return an image of each environment.
+
+        :return: the images
+        """
+        for remote in self.remotes:
+            remote.send(("render", None))
+        return _join([remote.recv() for remote in self.remotes])
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """
+        Return an attribute of each environment.
+
+        :param attr_name: the attribute's name
+        :param indices: the environments; None for all
+        :return: its values
+        """
+        return self._ask("get_attr", indices, attr_name)
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """
+        Set an attribute of each environment.
+
+        :param attr_name: the attribute's name
+        :param value: its value
+        :param indices: the environments; None for all
+        """
+        self._ask("set_attr", indices, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """
+        Call a method of each environment.
+
+        :param method_name: the method's name
+        :param method_args: its arguments
+        :param indices: the environments; None for all
+        :param method_kwargs: its keyword arguments
+        :return: its results
+        """
+        return self._ask("env_method", indices, method_name, *method_args, **method_kwargs)
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """
+        Return whether each environment has a wrapper.
+
+        :param wrapper_class: the wrapper
+        :param indices: the environments; None for all
+        :return: whether it has
+        """
+        return self._ask("env_is_wrapped", indices, wrapper_class)
+
+    def _get_target_remotes(self, indices: VecEnvIndices) -> list[Any]:
+        """Return the connections of the processes that some of the environments are in, for SB3's ``has_attr``."""
+        wanted = {index % self.num_envs for index in self._get_indices(indices)}
+        pairs = zip(self._bounds, self.remotes, strict=True)
+        return [remote for (start, stop), remote in pairs if not wanted.isdisjoint(range(start, stop))]
+
+    def _ask(self, method: str, indices: VecEnvIndices, *args: Any, **kwargs: Any) -> list[Any]:
+        """Call a method of each process's ``DummyVecEnv`` for some of the environments, and return a value of each."""
+        answers: dict[int, Any] = {}
+        wanted = [index % self.num_envs for index in self._get_indices(indices)]
+        asked = []
+        for (start, stop), remote in zip(self._bounds, self.remotes, strict=True):
+            own = [index for index in dict.fromkeys(wanted) if start <= index < stop]
+            if own:
+                remote.send(("call", (method, args, kwargs | {"indices": [index - start for index in own]})))
+                asked.append((remote, own))
+        for remote, own in asked:
+            values = remote.recv()
+            answers.update(zip(own, [None] * len(own) if values is None else values, strict=True))
+        return [answers[index] for index in wanted]
+
+    def get_training_state(self) -> dict[str, Any]:
+        """
+        Return what this object has to remember beside the states of the environments.
+
+        :return: the seeds and options of the next reset
+        """
+        return {"seeds": list(self._seeds), "options": list(self._options)}
+
+    def set_training_state(self, state: dict[str, Any]) -> None:
+        """
+        Restore what :meth:`get_training_state` returned.
+
+        :param state: the state
+        """
+        self._seeds, self._options = state["seeds"], state["options"]
+
+
+def _step_chunk(remote: Connection, parent_remote: Connection, env_fns: CloudpickleWrapper) -> None:
+    """Answer the requests of a :class:`ChunkedSubprocVecEnv` about the environments of one process."""
+    parent_remote.close()
+    envs = DummyVecEnv(env_fns.var)
+    while True:
+        try:
+            command, data = remote.recv()
+            if command == "step":
+                remote.send((*envs.step(data), envs.reset_infos))
+            elif command == "reset":
+                envs._seeds, envs._options = data
+                remote.send((envs.reset(), envs.reset_infos))
+            elif command == "call":
+                method, args, kwargs = data
+                remote.send(getattr(envs, method)(*args, **kwargs))
+            elif command == "has_attr":
+                remote.send(envs.has_attr(data))
+            elif command == "get_spaces":
+                remote.send((envs.observation_space, envs.action_space))
+            elif command == "render":
+                remote.send(envs.get_images())
+            else:
+                # "close"
+                envs.close()
+                remote.close()
+                break
+        except (EOFError, KeyboardInterrupt):
+            break
+
+
+def _concatenate(observations: Sequence[Any]) -> Any:
+    """Join the observations of all processes: arrays, or arrays by key, or tuples of arrays."""
+    first = observations[0]
+    if isinstance(first, dict):
+        return {key: np.concatenate([each[key] for each in observations]) for key in first}
+    if isinstance(first, tuple):
+        return tuple(np.concatenate(parts) for parts in zip(*observations, strict=True))
+    return np.concatenate(observations)
+
+
+def _join(lists: Sequence[Sequence[Any]]) -> list[Any]:
+    return [each for part in lists for each in part]
