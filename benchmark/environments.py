@@ -87,7 +87,7 @@ def test(package: Package, args: argparse.Namespace) -> Iterator[dict[str, Any]]
 
     :param package: the package
     :param args: the command line
-    :return: yields the record when the package is installed or not, and after each environment
+    :return: yields the record after each environment, or once if the package cannot be installed
     """
     folder = (args.work / package.name).resolve()
     installation = install(args.python, PROJECT, package.requirements, folder / "venv", args.install_timeout)
@@ -104,7 +104,7 @@ def test(package: Package, args: argparse.Namespace) -> Iterator[dict[str, Any]]
     }
     if "failure" in installation:
         print(f"  not installed: {installation['failure']}", flush=True)
-    yield record
+        yield record
     for environment in package.environments if "failure" not in installation else ():
         name = canonicalize_name(environment.id.replace("/", "-").replace(" ", "-"))
         found = check(environment, folder / "venv" / "bin" / "python", folder / name, args.timeout, args.keep)

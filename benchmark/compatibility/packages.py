@@ -138,6 +138,22 @@ class SupersuitAdapter(VecEnvWrapper):
 agents = supersuit.pettingzoo_env_to_vec_env_v1(simple_spread_v3.parallel_env(continuous_actions=True))
 env = supersuit.concat_vec_envs_v1(agents, 1, base_class="stable_baselines3")
 env = VecMonitor(SupersuitAdapter(env))"""
+ALOHA = """\
+import os
+
+os.environ["MUJOCO_GL"] = "egl"  # draws without a display
+
+import gym_aloha
+from gymnasium.wrappers import FilterObservation, FlattenObservation
+from stable_baselines3.common.env_util import make_vec_env
+
+
+def joints(env):
+    return FlattenObservation(FilterObservation(env, ["agent_pos"]))
+
+
+arguments = dict(obs_type="pixels_agent_pos", observation_width=64, observation_height=48)
+env = make_vec_env("gym_aloha/AlohaTransferCube-v0", env_kwargs=arguments, wrapper_class=joints)"""
 # MuJoCo's version is that of constraints.txt: later ones lack a field that these packages read
 MUJOCO = "mujoco==3.8.0"
 
@@ -227,6 +243,7 @@ PACKAGES = (
                 "Meta-World/MT1 reach-v3", made("Meta-World/MT1", "metaworld", 'env_kwargs=dict(env_name="reach-v3", seed=0)')
             ),
         ),
+        ("metaworld 3.1 needs MuJoCo 3.3.0: pip takes 3.0 to agree with constraints.txt.",),
     ),
     Package(
         "gym-pusht",
@@ -308,7 +325,7 @@ PACKAGES = (
                 wrappers="supersuit's, an adapter",
                 notes=(
                     "The agents share one policy: each is an environment of the vector environment.",
-                    "The adapter seeds the environments, and reports the time limit that ends an episode: supersuit does neither.",
+                    "The adapter seeds the environments and reports time limits: supersuit does neither.",
                 ),
             ),
         ),
@@ -335,10 +352,9 @@ PACKAGES = (
         (
             Environment(
                 "gym_aloha/AlohaTransferCube-v0",
-                'import os\n\nos.environ["MUJOCO_GL"] = "egl"  # draws without a display\n\n'
-                + made("gym_aloha/AlohaTransferCube-v0", "gym_aloha", 'env_kwargs=dict(obs_type="pixels_agent_pos")'),
-                policy="MultiInputPolicy",
-                buffer_size=250,
+                ALOHA,
+                wrappers="`FilterObservation`, `FlattenObservation`",
+                notes=("SB3 takes no nested `Dict` observations: the policy sees the joints alone.",),
             ),
         ),
     ),

@@ -110,9 +110,7 @@ def _section(package: Package, record: dict[str, Any]) -> str:
     installation = record["installation"]
     if "failure" in installation:
         lines.append(f"- It was not installed: {installation['failure']}")
-    elif not record["environments"]:
-        lines.append("- It was installed; its environments are not checked yet.")
-    else:
+    elif record["environments"]:
         versions = ", ".join(f"{name} {record['versions'].get(name, 'missing')}" for name in package.distributions)
         lines.append(f"- Tested: {versions}, with Python {record['python']}. {_pins(record)}")
     lines += [f"- {note}" for note in package.notes]
