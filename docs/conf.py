@@ -13,7 +13,7 @@ copyright = author
 version = release = installed_version("sb3-cgp")
 
 root_doc = "docs/index"
-include_patterns = ["README.md", "CHANGELOG.md", "docs/**", "benchmark/results/**"]
+include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/**", "benchmark/results/**"]
 exclude_patterns = [".*", "build", "dist", "logs", "venv"]
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx_copybutton", "site_curves", "site_diagrams"]

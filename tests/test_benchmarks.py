@@ -186,7 +186,8 @@ def test_runtime_table_says_what_was_measured(runtime_folder):
     assert re.match("not measured: .*sbx", rows["SBX-TD3"][0])
     assert "CGP-4" not in rows
     assert (record["env"], record["episode_steps"], record["seed"]) == ("Pendulum-v1", 6, 5)
-    assert record["versions"]["torch"] == th.__version__
+    # Of PyPI's builds for CUDA, PyTorch alone names the local version
+    assert record["versions"]["torch"] in (th.__version__, th.__version__.partition("+")[0])
     assert record["machine"]["torch_threads"] == 1
     assert record["command"].startswith("python -m benchmark.runtime --env Pendulum-v1 ")
     assert record["command"] in text
