@@ -714,7 +714,7 @@ def test_the_selector_is_unchanged():
 PAGE = (Path(__file__).parent.parent / "docs" / "population.md").read_text()
 
 
-@pytest.mark.parametrize("example", re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL), ids=range(2))
+@pytest.mark.parametrize("example", re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL), ids=range(3))
 def test_the_pages_examples_run(example, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     names = {"__name__": "__main__"}

@@ -75,7 +75,7 @@ class AdaptedVecEnv(VecEnv):
         observations, rewards, terminations, truncations, info = self._env.step(self._actions)
         dones = terminations | truncations
         infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
-        for index in np.flatnonzero(dones):
+        for index in np.flatnonzero(dones).tolist():
             infos[index]["TimeLimit.truncated"] = bool(truncations[index] and not terminations[index])
             observations[index] = self._end_episode(index, observations, infos[index], info)
         return observations, rewards, dones, infos
