@@ -17,9 +17,10 @@ from benchmark.sweeps.claimed_runs import ClaimedRuns
 from benchmark.sweeps.groups import Group
 from benchmark.sweeps.population_reporter import PopulationReporter
 from benchmark.sweeps.run import begin, register_all
+from benchmark.sweeps.runs import Run
 from benchmark.sweeps.sharing import agent_arguments, ordinary_model
 from benchmark.sweeps.zoo_experiments import new_experiment, resumed_experiment
-from sb3_cgp import TrainingCheckpointCallback
+from sb3_cgp import RestorableEnv, TrainingCheckpointCallback
 from sb3_cgp.population import Population, PopulationEvalCallback, evaluate_population
 from sb3_cgp.resumption.store import NoStateLeftError, StateStore
 from sb3_cgp.zoo.resumed_run import continue_monitors
@@ -101,16 +102,19 @@ def _set_up(group: Group, folders: Sequence[Path], device: str) -> tuple[list[Ag
 
 
 def _join(group: Group, experiments: Sequence[AgentExperiment], eval_env: bool = False) -> VecEnv:
-    """Return the environments of all runs, each made and seeded by rl_zoo3's manager of its run."""
-    env = DummyVecEnv([partial(_only_env, experiment, eval_env) for experiment in experiments])
+    """Return the environments of all runs, each made by rl_zoo3's manager of its run, and seeded as it would seed them."""
+    makers = [partial(_make_env, run, experiment, eval_env) for run, experiment in zip(group.runs, experiments, strict=True)]
+    env = DummyVecEnv(makers)
     _seed(env, [run.seed for run in group.runs])
     return env
 
 
-def _only_env(experiment: AgentExperiment, eval_env: bool) -> gym.Env:
+def _make_env(run: Run, experiment: AgentExperiment, eval_env: bool) -> gym.Env:
+    """Make the environment of a run, also in another process."""
+    register_all(run)
     env = experiment.create_envs(1, eval_env=eval_env)
     assert isinstance(env, DummyVecEnv)
-    return env.envs[0]
+    return RestorableEnv(env.envs[0])
 
 
 def _seed(env: VecEnv, seeds: Sequence[int]) -> None:
