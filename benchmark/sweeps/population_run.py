@@ -8,7 +8,7 @@ from pathlib import Path
 
 import gymnasium as gym
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.utils import get_device, set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from benchmark.common.records import EVALUATION_SEED, FINAL_EPISODES
@@ -21,7 +21,7 @@ from benchmark.sweeps.runs import Run
 from benchmark.sweeps.sharing import agent_arguments, ordinary_model
 from benchmark.sweeps.zoo_experiments import new_experiment, resumed_experiment
 from sb3_cgp import RestorableEnv, TrainingCheckpointCallback
-from sb3_cgp.population import Population, PopulationEvalCallback, evaluate_population
+from sb3_cgp.population import ChunkedSubprocVecEnv, Population, PopulationEvalCallback, evaluate_population
 from sb3_cgp.resumption.store import NoStateLeftError, StateStore
 from sb3_cgp.zoo.resumed_run import continue_monitors
 
@@ -54,7 +54,7 @@ def train_group(
     assert population.env is not None
     first = group.runs[0]
     evaluation = PopulationEvalCallback(
-        _join(group, experiments, eval_env=True),
+        _join(group, experiments, device, eval_env=True),
         n_eval_episodes=first.evaluation_episodes,
         eval_freq=first.evaluation_interval,
         verbose=0,
@@ -87,7 +87,7 @@ def _set_up(group: Group, folders: Sequence[Path], device: str) -> tuple[list[Ag
     set_random_seed(runs[0].seed)
     for experiment in experiments:
         experiment.setup_experiment()
-    env = _join(group, experiments)
+    env = _join(group, experiments, device)
     if continues:
         population = Population.resume(group.states, env, device=device)
         assert population.resumption is not None
@@ -101,10 +101,13 @@ def _set_up(group: Group, folders: Sequence[Path], device: str) -> tuple[list[Ag
     return experiments, Population("MlpPolicy", env, arguments, device=device)
 
 
-def _join(group: Group, experiments: Sequence[AgentExperiment], eval_env: bool = False) -> VecEnv:
+def _join(group: Group, experiments: Sequence[AgentExperiment], device: str, eval_env: bool = False) -> VecEnv:
     """Return the environments of all runs, each made by rl_zoo3's manager of its run, and seeded as it would seed them."""
-    makers = [partial(_make_env, run, experiment, eval_env) for run, experiment in zip(group.runs, experiments, strict=True)]
-    env = DummyVecEnv(makers)
+    makers: list[Callable[[], gym.Env]] = [
+        partial(_make_env, run, experiment, eval_env) for run, experiment in zip(group.runs, experiments, strict=True)
+    ]
+    # On a CPU, the simulators would take the cores of the gradient steps
+    env: VecEnv = ChunkedSubprocVecEnv(makers) if get_device(device).type == "cuda" else DummyVecEnv(makers)
     _seed(env, [run.seed for run in group.runs])
     return env
 
