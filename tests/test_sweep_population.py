@@ -9,6 +9,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+import torch as th
 import yaml
 from optuna.storages import InMemoryStorage
 from rl_zoo3 import ALGOS
@@ -30,6 +31,7 @@ from benchmark.sweeps.run import run_folder
 from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.worker_loop import execute_runs
+from sb3_cgp.population import ChunkedSubprocVecEnv
 from sb3_cgp.resumption.store import StateStore
 
 TINY = dict(policy="MlpPolicy", learning_starts=20, batch_size=8, buffer_size=400, policy_kwargs="dict(net_arch=[8, 8])")
@@ -191,6 +193,24 @@ def test_a_population_whose_states_are_damaged_begins_anew(tmp_path, runs_of):
     anew = Taken()
     assert train_group(group, folders, anew, lambda step: None, "cpu") == straight[0]
     assert anew.reports == straight[1].reports
+
+
+def test_on_a_gpu_environments_are_in_other_processes_and_the_same(tmp_path, runs_of, monkeypatch):
+    runs, made = runs_of({"A": ("td3", NOISE)}, steps=90), []
+    finals, taken, folders = train_together(runs, tmp_path / "here")
+
+    def in_processes(makers):
+        # SB3's default imports all packages in each process, which takes long
+        made.append(ChunkedSubprocVecEnv(makers, n_processes=2, start_method="fork"))
+        return made[-1]
+
+    monkeypatch.setattr(population_run, "get_device", lambda device: th.device("cuda"))
+    monkeypatch.setattr(population_run, "ChunkedSubprocVecEnv", in_processes)
+    again, as_before, others = train_together(runs, tmp_path / "there", 70)
+    # To train and to evaluate, before and after the interruption
+    assert len(made) == 4
+    assert (again, as_before.reports) == (finals, taken.reports)
+    assert [rows(each) for each in others] == [rows(each) for each in folders]
 
 
 # --- In a study ---

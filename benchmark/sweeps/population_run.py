@@ -8,7 +8,7 @@ from pathlib import Path
 
 import gymnasium as gym
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.utils import get_device, set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from benchmark.common.records import EVALUATION_SEED, FINAL_EPISODES
@@ -17,10 +17,11 @@ from benchmark.sweeps.claimed_runs import ClaimedRuns
 from benchmark.sweeps.groups import Group
 from benchmark.sweeps.population_reporter import PopulationReporter
 from benchmark.sweeps.run import begin, register_all
+from benchmark.sweeps.runs import Run
 from benchmark.sweeps.sharing import agent_arguments, ordinary_model
 from benchmark.sweeps.zoo_experiments import new_experiment, resumed_experiment
-from sb3_cgp import TrainingCheckpointCallback
-from sb3_cgp.population import Population, PopulationEvalCallback, evaluate_population
+from sb3_cgp import RestorableEnv, TrainingCheckpointCallback
+from sb3_cgp.population import ChunkedSubprocVecEnv, Population, PopulationEvalCallback, evaluate_population
 from sb3_cgp.resumption.store import NoStateLeftError, StateStore
 from sb3_cgp.zoo.resumed_run import continue_monitors
 
@@ -53,7 +54,7 @@ def train_group(
     assert population.env is not None
     first = group.runs[0]
     evaluation = PopulationEvalCallback(
-        _join(group, experiments, eval_env=True),
+        _join(group, experiments, device, eval_env=True),
         n_eval_episodes=first.evaluation_episodes,
         eval_freq=first.evaluation_interval,
         verbose=0,
@@ -86,7 +87,7 @@ def _set_up(group: Group, folders: Sequence[Path], device: str) -> tuple[list[Ag
     set_random_seed(runs[0].seed)
     for experiment in experiments:
         experiment.setup_experiment()
-    env = _join(group, experiments)
+    env = _join(group, experiments, device)
     if continues:
         population = Population.resume(group.states, env, device=device)
         assert population.resumption is not None
@@ -100,17 +101,23 @@ def _set_up(group: Group, folders: Sequence[Path], device: str) -> tuple[list[Ag
     return experiments, Population("MlpPolicy", env, arguments, device=device)
 
 
-def _join(group: Group, experiments: Sequence[AgentExperiment], eval_env: bool = False) -> VecEnv:
-    """Return the environments of all runs, each made and seeded by rl_zoo3's manager of its run."""
-    env = DummyVecEnv([partial(_only_env, experiment, eval_env) for experiment in experiments])
+def _join(group: Group, experiments: Sequence[AgentExperiment], device: str, eval_env: bool = False) -> VecEnv:
+    """Return the environments of all runs, each made by rl_zoo3's manager of its run, and seeded as it would seed them."""
+    makers: list[Callable[[], gym.Env]] = [
+        partial(_make_env, run, experiment, eval_env) for run, experiment in zip(group.runs, experiments, strict=True)
+    ]
+    # On a CPU, the simulators would take the cores of the gradient steps
+    env: VecEnv = ChunkedSubprocVecEnv(makers) if get_device(device).type == "cuda" else DummyVecEnv(makers)
     _seed(env, [run.seed for run in group.runs])
     return env
 
 
-def _only_env(experiment: AgentExperiment, eval_env: bool) -> gym.Env:
+def _make_env(run: Run, experiment: AgentExperiment, eval_env: bool) -> gym.Env:
+    """Make the environment of a run, also in another process."""
+    register_all(run)
     env = experiment.create_envs(1, eval_env=eval_env)
     assert isinstance(env, DummyVecEnv)
-    return env.envs[0]
+    return RestorableEnv(env.envs[0])
 
 
 def _seed(env: VecEnv, seeds: Sequence[int]) -> None:
