@@ -13,8 +13,8 @@ TOP = """\
 # Tested environments
 
 CGP on the environments of other packages. Each package is installed from PyPI into a virtual environment of its own, and each
-environment is checked there. `make test-environments` does both, and writes this page. The `env` of a section's code is trained
-on by `CGP(policy, env)`, with the policy and the `replay_buffer_class` that the table names. [Your own
+environment is checked there. `make test-environments` does both, and writes this page. The `env` of a section's code is
+trained on by `CGP(policy, env)`, with the policy and the `replay_buffer_class` that the table names. [Your own
 environment](environments.md) says what CGP needs of one.
 """
 NOTES = """\
@@ -85,7 +85,8 @@ def _cells(environment: Environment, found: dict[str, Any]) -> list[str]:
         return ["no", *[UNKNOWN] * 4]
     failed = [name for name in ("predicts", "saves and loads") if name in errors]
     trains = f"yes, but: {', '.join(failed)}" if failed else "yes"
-    resumes = "no" if found["resumes"] is None else found["resumes"]
+    # Without an error, the check was interrupted
+    resumes = found["resumes"] or ("no" if {"stopped", "resumed"} & found["errors"].keys() else UNKNOWN)
     largest = found.get("export_difference")
     return [trains, resumes, "no" if largest is None else f"yes ({largest:.0e})", _speed(found), _learns(environment, found)]
 
