@@ -179,7 +179,7 @@ def test_pins_that_contradict_a_package_are_dropped_but_for_pytorchs(stand_in, t
         ("File /home/me/venv/lib/x.py fails", "File x.py fails"),
         ("ERROR: file:///opt/wheels/y.whl", "ERROR: y.whl"),
         ("see https://example.org/a/b, and 1/2", "see https://example.org/a/b, and 1/2"),
-        ("x" * 500, "x" * 397 + "..."),
+        ("x" * 1_501, "x" * 1_497 + "..."),
     ],
 )
 def test_messages_are_lines_without_paths(text, expected):
@@ -319,6 +319,9 @@ def test_a_page_has_returns_successes_and_what_was_noticed(monkeypatch):
         "random_returns": [-50.0, -49.0],
         "successes": 19,
         "random_successes": 0,
+        "observations": "Box([-1. 0.], [1. inf], (2,), float32)",
+        "why_not_restorable": "a.Simulator is unknown and has no get_training_state(): it needs x. b.C is unknown and has no "
+        "get_training_state(): it needs x.",
     }
     record = {
         "package": "works",
@@ -336,8 +339,10 @@ def test_a_page_has_returns_successes_and_what_was_noticed(monkeypatch):
     assert rows_of(text)["works: Works-v0"][2:] == cells
     for line in (
         '`pip install "works<2"`',
-        "- Tested: works 1.2, with Python 3.11.7. All versions are those of constraints.txt.",
+        "- Tested: works 1.2, with Python 3.11.7. No version differs from constraints.txt.",
         "- A note.",
+        "- Observations: `Box([...], [...], (2,), float32)`; actions: `Box(1,)`.",
+        "- Not restored: the state of a.Simulator, b.C is unknown ([what helps](trust.md#environments-of-others)).",
         "Commit abc, on A processor, 2 cores, load average 3.",
         "- Two trainings with one seed differ: the environment does not repeat itself.",
     ):

@@ -1,5 +1,6 @@
 """The page of the tested environments, from the records of the packages."""
 
+import re
 from collections.abc import Mapping
 from statistics import mean
 from typing import Any
@@ -12,8 +13,9 @@ TOP = """\
 # Tested environments
 
 CGP on the environments of other packages. Each package is installed from PyPI into a virtual environment of its own, and each
-environment is checked there. `make test-environments` does both, and writes this page; [your own environment](environments.md)
-says what CGP needs of an environment.
+environment is checked there. `make test-environments` does both, and writes this page. The `env` of a section's code is
+trained on by `CGP(policy, env)`, with the policy and the `replay_buffer_class` that the table names. [Your own
+environment](environments.md) says what CGP needs of one.
 """
 NOTES = """\
 - **trains**: 220 steps by CGP's defaults (networks of 256 and 256 units, batches of 128) but for 110 random steps and a
@@ -83,7 +85,8 @@ def _cells(environment: Environment, found: dict[str, Any]) -> list[str]:
         return ["no", *[UNKNOWN] * 4]
     failed = [name for name in ("predicts", "saves and loads") if name in errors]
     trains = f"yes, but: {', '.join(failed)}" if failed else "yes"
-    resumes = "no" if found["resumes"] is None else found["resumes"]
+    # Without an error, the check was interrupted
+    resumes = found["resumes"] or ("no" if {"stopped", "resumed"} & found["errors"].keys() else UNKNOWN)
     largest = found.get("export_difference")
     return [trains, resumes, "no" if largest is None else f"yes ({largest:.0e})", _speed(found), _learns(environment, found)]
 
@@ -137,7 +140,7 @@ def _quoted(requirement: str) -> str:
 def _pins(record: dict[str, Any]) -> str:
     """Return how the versions compare with those of ``constraints.txt``."""
     if record["installation"]["pins"] == "all":
-        return "All versions are those of constraints.txt."
+        return "No version differs from constraints.txt."
     others = ", ".join(f"{name} {found} (there {pinned})" for name, (found, pinned) in record["other_versions"].items())
     return f"The package contradicts constraints.txt. Other than there: {others or 'nothing'}."
 
@@ -146,11 +149,25 @@ def _facts(found: dict[str, Any]) -> list[str]:
     """Return what was noticed in the check, as sentences."""
     facts = []
     if "observations" in found:
-        facts.append(f"Observations: `{found['observations']}`; actions: `{found['actions']}`.")
+        observations, actions = (_space(found[key]) for key in ("observations", "actions"))
+        facts.append(f"Observations: `{observations}`; actions: `{actions}`.")
     if found.get("repeats") is False:
         facts.append("Two trainings with one seed differ: the environment does not repeat itself.")
     if found.get("why_not_restorable") is not None:
-        facts.append(f"Not restored: {found['why_not_restorable']}")
+        facts.append(f"Not restored: {_reason(found['why_not_restorable'])}")
     for errors in found.get("errors", {}).values():
         facts += [f"Failed ({step}): {error}" for step, error in errors.items()]
     return facts
+
+
+def _space(text: str) -> str:
+    """Return the description of a space without the arrays of its bounds."""
+    return re.sub(r"\[[^][]*\]", "[...]", text)
+
+
+def _reason(text: str) -> str:
+    """Return why an environment is not restored, in fewer words where classes are unknown."""
+    unknown = re.findall(r"([\w.]+) is unknown and has no get_training_state\(\)", text)
+    if not unknown:
+        return text
+    return f"the state of {', '.join(unknown)} is unknown ([what helps](trust.md#environments-of-others))."

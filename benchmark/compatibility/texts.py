@@ -2,7 +2,7 @@
 
 import re
 
-LONGEST = 400
+LONGEST = 1_500
 
 
 def in_a_line(text: str) -> str:
