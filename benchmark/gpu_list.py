@@ -85,6 +85,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     add_epilog(
         parser,
         "examples:\n  python -m benchmark.gpu_list --minutes 9\n  python -m benchmark.gpu_list --rehearse --folder rehearsal",
+        "It takes hours of a GPU, in as many calls as are made.",
         "The same command continues. Logs, results, and the list's own record, gpu_list.json, are written to --folder.",
     )
     return parser.parse_args(argv)

@@ -1,7 +1,10 @@
 """The measurements of populations: what is counted, what estimates follow from, and what is kept. Times are not tested."""
 
 import json
+import os
+import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -24,6 +27,7 @@ from benchmark.speed.population_points import ALONE, points_in_order
 from sb3_cgp.population.gradient_step import GradientStep
 
 CPU = th.device("cpu")
+ROOT = Path(__file__).parent.parent
 B, F, A, H = 128, 17, 6, 256
 
 
@@ -213,6 +217,27 @@ def test_without_the_packages_of_page_and_figure_the_record_is_written(tmp_path,
     assert json.loads((tmp_path / "population.json").read_text())["estimates"]["points"]
     assert not (tmp_path / "population.md").exists()
     assert "not written" in capsys.readouterr().out
+
+
+def test_a_bare_machine_has_enough_for_the_command_and_the_list(tmp_path):
+    """Without rl_zoo3, Optuna, and what else the extras bring."""
+    missing = ["rl_zoo3", "optuna", "pytablewriter", "matplotlib", "pandas", "rliable", "scipy", "tensorboard"]
+    missing += ["sb3_contrib", "onnx", "psutil"]
+    (tmp_path / "sitecustomize.py").write_text(f"import sys\nsys.modules.update(dict.fromkeys({missing!r}))\n")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+
+    def run(*command):
+        return subprocess.run([sys.executable, "-m", *command], cwd=ROOT, env=environment, capture_output=True, text=True)
+
+    options = "--device cpu --only-estimate --methods TD3 --numbers 1 --folder"
+    result = run("benchmark.population", *options.split(), str(tmp_path))
+    assert result.returncode == 0, result.stderr
+    assert "pytablewriter" in result.stdout
+    assert json.loads((tmp_path / "population.json").read_text())["estimates"]["points"]
+    result = run("benchmark.gpu_list", "--list", "--folder", str(tmp_path))
+    assert result.returncode == 0, result.stderr
+    # The other commands say what they need
+    assert "needs rl_zoo3" in run("benchmark.runtime", "--help").stderr
 
 
 def test_ways_of_stepping_are_measured_in_turn_and_missing_packages_are_named(tmp_path, monkeypatch):
