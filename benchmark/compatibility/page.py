@@ -32,6 +32,7 @@ NOTES = """\
 - **learns**: the mean return of 20 episodes by random actions, and by the actor after a training of so many steps, whose
   arguments are in `benchmark/compatibility/packages.py`; and how many of these episodes ended in success, where the
   environment reports it.
+- "–" stands for what was not checked, or was interrupted.
 """
 UNKNOWN = "–"
 
