@@ -64,7 +64,8 @@ train: $(INSTALLED) ## install, train with rl_zoo3, evaluate and draw the learni
 	  --tensorboard-log "$(LOGS)/tensorboard" \
 	  $(if $(PARAMS),-params $$3 $(PARAMS),$${3:+-params $$3}) $(ARGS)) && \
 	if test -n "$$interrupted"; then \
-	  $(if $(filter cgp,$(ALGO)),echo "or  make resume RUN=\"$(LOGS)/$(ALGO)/$(subst /,-,$(ENV))_$$2\"";) exit 130; fi && \
+	  run="$(LOGS)/$(ALGO)/$(subst /,-,$(ENV))_$$2"; \
+	  if ls "$$run"/state/state-*.json > /dev/null 2>&1; then echo "or  make resume RUN=\"$$run\""; fi; exit 130; fi && \
 	$(IN_VENV) -m benchmark.report --algo $(ALGO) --env $(ENV) --folder "$(LOGS)" --exp-id $$2
 
 resume: $(INSTALLED) ## continue an interrupted run of CGP to its end, and report: make resume RUN=logs/cgp/Pendulum-v1_1

@@ -57,7 +57,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         parser,
         "examples:\n  python -m benchmark.environments\n  python -m benchmark.environments --packages panda-gym metaworld",
         "It takes about two minutes and two gigabytes a package, of which it keeps none.",
-        "This repository's own records are in benchmark/results/environments, its page is docs/tested_environments.md.",
+        "Records and the page are written to results/environments (--folder); this repository's own are in\n"
+        "benchmark/results/environments and docs/tested_environments.md.",
     )
     return parser.parse_args(argv)
 

@@ -135,14 +135,17 @@ def test_failed_training_is_not_reported(clone: Clone) -> None:
     assert not starting(calls, "-m benchmark.report")
 
 
-@pytest.mark.parametrize("algo", ["cgp", "td3"])
-def test_an_interrupted_training_says_how_it_is_continued(algo: str, clone: Clone) -> None:
-    calls, ended = clone.make("train", f"ALGO={algo}", "ENV=my_space/Env-v0", "LOGS=my logs", INTERRUPT="yes")
+@pytest.mark.parametrize("has_state", [True, False])
+def test_an_interrupted_training_says_how_it_is_continued(has_state: bool, clone: Clone) -> None:
+    if has_state:
+        state = clone.folder / "my logs" / "cgp" / "my_space-Env-v0_4" / "state"
+        state.mkdir(parents=True)
+        (state / "state-000000000100.json").touch()
+    calls, ended = clone.make("train", "ENV=my_space/Env-v0", "LOGS=my logs", INTERRUPT="yes")
     assert ended.returncode != 0
     assert starting(calls, "-m rl_zoo3.train")
     assert not starting(calls, "-m benchmark.report")
-    # Other algorithms' runs save no states
-    assert ('make resume RUN="my logs/cgp/my_space-Env-v0_4"' in ended.stdout) == (algo == "cgp")
+    assert ('make resume RUN="my logs/cgp/my_space-Env-v0_4"' in ended.stdout) == has_state
 
 
 def test_resume_goes_on_with_the_named_run_and_reports_it(clone: Clone) -> None:

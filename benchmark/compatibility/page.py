@@ -171,4 +171,4 @@ def _reason(text: str) -> str:
     unknown = re.findall(r"([\w.]+) is unknown and has no get_training_state\(\)", text)
     if not unknown:
         return text
-    return f"the state of {', '.join(unknown)} is unknown ([what helps](trust.md#environments-of-others))."
+    return f"the state of {', '.join(unknown)} is unknown ([what helps](environments.md#environments-of-other-packages))."

@@ -180,23 +180,28 @@ def is_finished(folder: Path, args: argparse.Namespace, hyperparams: dict[str, A
     :param hyperparams: the run's hyperparameters
     :return: whether the final model exists and its training was complete. rl_zoo3 also saves a model after Ctrl-C, which may
         come before the last environment step or during offline policy training.
-    :raises FileNotFoundError: if the run has not ended and has no state
+    :raises FileNotFoundError: if the training is not complete, and has no state
     """
     states = states_of(folder, hyperparams)
     steps = StateStore(states).steps()
     env_name = EnvironmentName(args.env)
     model = folder / f"{env_name}.zip"
     n_timesteps = args.n_timesteps if args.n_timesteps > 0 else int(hyperparams["n_timesteps"])
-    if not steps and not model.is_file():
-        raise FileNotFoundError(
-            f"There is no state in {states}: the run ended before it saved one, or has no TrainingCheckpointCallback. "
-            f"Start it anew, by the command in {folder / env_name / 'command.txt'}"
-        )
-    if not model.is_file() or not steps:
-        return model.is_file()
+    anew = f"Start it anew, by the command in {folder / env_name / 'command.txt'}"
+    if not model.is_file():
+        if not steps:
+            reason = "the run ended before it saved one, or has no TrainingCheckpointCallback"
+            raise FileNotFoundError(f"There is no state in {states}: {reason}. {anew}")
+        return False
     data, _, _ = load_from_zip_file(model, device="cpu")
     assert data is not None
-    return max(steps) >= n_timesteps and not data["_policy_is_due"]
+    n_done = max(steps, default=data["num_timesteps"])
+    is_complete = bool(n_done >= n_timesteps and not data["_policy_is_due"])
+    if not steps and not is_complete:
+        raise FileNotFoundError(
+            f"The run was interrupted at step {n_done:,} of {n_timesteps:,}, before it saved a state in {states}. {anew}"
+        )
+    return is_complete
 
 
 def set_up(folder: Path, args: argparse.Namespace, hyperparams: dict[str, Any]) -> tuple[ResumedExperiment, BaseAlgorithm]:
