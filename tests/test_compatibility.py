@@ -342,7 +342,8 @@ def test_a_page_has_returns_successes_and_what_was_noticed(monkeypatch):
         "- Tested: works 1.2, with Python 3.11.7. No version differs from constraints.txt.",
         "- A note.",
         "- Observations: `Box([...], [...], (2,), float32)`; actions: `Box(1,)`.",
-        "- Not restored: the state of a.Simulator, b.C is unknown ([what helps](environments.md#environments-of-other-packages)).",
+        "- Not restored: the state of a.Simulator, b.C is unknown "
+        "([what helps](environments.md#environments-of-other-packages)).",
         "Commit abc, on A processor, 2 cores, load average 3.",
         "- Two trainings with one seed differ: the environment does not repeat itself.",
     ):

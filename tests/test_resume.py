@@ -264,12 +264,12 @@ def test_bad_arguments_are_refused(arguments, message):
         TrainingCheckpointCallback(**arguments)
 
 
-def test_without_a_path_nothing_happens(tmp_path, monkeypatch):
+def test_without_a_path_a_warning_says_that_nothing_is_saved(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     handler = signal.getsignal(signal.SIGTERM)
-    CGP("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[8]), **SMALL).learn(
-        40, callback=TrainingCheckpointCallback(10)
-    )
+    model = CGP("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[8]), **SMALL)
+    with pytest.warns(UserWarning, match="No state of the training will be saved, as `path` is None"):
+        model.learn(40, callback=TrainingCheckpointCallback(10))
     assert list(tmp_path.iterdir()) == []
     assert signal.getsignal(signal.SIGTERM) is handler
 

@@ -15,7 +15,8 @@ def check_action_space(action_space: spaces.Space[Any]) -> None:
     :param action_space: the environment's action space
     :raises ValueError: if it is of another kind or dtype, empty, unbounded, or so wide that ``high - low`` overflows its dtype
     """
-    require(isinstance(action_space, spaces.Box), "action_space", action_space, "a gymnasium.spaces.Box")
+    allowed = "a gymnasium.spaces.Box; for Discrete actions take DQN or PPO of Stable-Baselines3"
+    require(isinstance(action_space, spaces.Box), "action_space", action_space, allowed)
     assert isinstance(action_space, spaces.Box)
     require(
         np.issubdtype(action_space.dtype, np.floating),

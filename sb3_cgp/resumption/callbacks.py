@@ -3,6 +3,7 @@
 import os
 import signal
 import threading
+import warnings
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -81,6 +82,10 @@ class TrainingCheckpointCallback(BaseCallback):
         self._is_in_rollouts = self._rollout_is_over = self._has_trained_without_rollouts = False
         self._saved_at = self.num_timesteps
         if self.path is None:
+            allowed = "TrainingCheckpointCallback(save_freq, path='run/state')"
+            warnings.warn(
+                f"No state of the training will be saved, as `path` is None; give a folder, as in {allowed}.", stacklevel=2
+            )
             return
         check_replay_buffer(self.model._ensure_replay_buffer())
         self._store = StateStore(self._folder, self.keep)
