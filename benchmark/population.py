@@ -16,7 +16,7 @@ import torch as th
 
 from benchmark.common.arguments import continuous_environment, count
 from benchmark.common.files import write_json
-from benchmark.common.measuring import measuring_parser
+from benchmark.common.measuring import TIME_OVER, measuring_parser
 from benchmark.common.provenance import conditions
 from benchmark.speed.card_estimates import estimate_all
 from benchmark.speed.population_methods import METHODS
@@ -25,8 +25,6 @@ from sb3_cgp.common.files import write_atomically
 from sb3_cgp.population.environments import available_cores
 
 RECORDED = ("env", "seed", "rounds", "steps", "processes")
-# The exit code where the time is over before the last point
-TIME_OVER = 3
 NUMBERS = [1, 4, 8, 16, 32, 64]
 
 
