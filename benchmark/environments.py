@@ -45,7 +45,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--packages", nargs="+", default=names, choices=names, metavar="NAME", help=f"some of {', '.join(names)}"
     )
-    parser.add_argument("--missing", action="store_true", help="only packages that have no record yet")
+    parser.add_argument("--missing", action="store_true", help="only packages without a record of all environments")
     parser.add_argument("--keep", action="store_true", help="keep the virtual environments, and what was checked")
     add("--python", sys.executable, "the interpreter that makes the virtual environments")
     add("--work", Path("build/environments"), "folder of the virtual environments and the checks' files", type=Path)
@@ -72,14 +72,31 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parse(sys.argv[1:] if argv is None else argv)
     for package in PACKAGES:
         record = args.folder / f"{package.name}.json"
-        if package.name not in args.packages or (args.missing and record.is_file()):
+        earlier = tested(package, record)
+        if package.name not in args.packages or (args.missing and len(earlier) == len(package.environments)):
             continue
         print(f"{package.name}: installing {' '.join(package.requirements)}", flush=True)
         for found in test(package, args):
-            write_json(record, found)
-            write_page(args)
+            # An interruption or a failed installation loses nothing, and no record mixes two machines or versions
+            if earlier <= found["environments"].keys():
+                write_json(record, found)
+                write_page(args)
+        if not earlier <= found["environments"].keys():
+            print(f"  {record} stays as it was, with {len(earlier)} environments", flush=True)
     # Also where nothing is left to test, as with other declarations or another page
     write_page(args)
+
+
+def tested(package: Package, record: Path) -> set[str]:
+    """
+    Return which environments of a package have been tested.
+
+    :param package: the package
+    :param record: the file of its record
+    :return: their ids, without those that are not declared any more
+    """
+    known = json.loads(record.read_text())["environments"] if record.is_file() else {}
+    return {environment.id for environment in package.environments} & known.keys()
 
 
 def test(package: Package, args: argparse.Namespace) -> Iterator[dict[str, Any]]:

@@ -3,7 +3,8 @@ Do, on a GPU that is there for a short time, what is worth most first: the tests
 the paper's sweeps as populations.
 
 ``python -m benchmark.gpu_list --minutes 9`` ends within nine minutes. The same command continues: steps that are done are
-skipped, and a stopped one goes on from what it has written. ``--rehearse`` does all of it on the CPU, with tiny sizes.
+skipped unless their command has changed, and a stopped one goes on from what it has written; a test file, which cannot, begins
+anew. ``--rehearse`` does all of it on the CPU, with tiny sizes, in a folder of its own.
 """
 
 import argparse
@@ -21,6 +22,8 @@ import yaml
 
 from benchmark.common.arguments import add_epilog, count, output_folder
 from benchmark.common.files import write_json
+from benchmark.common.measuring import TIME_OVER
+from sb3_cgp.common.files import write_atomically
 
 ROOT = Path(__file__).parents[1]
 TESTS = ("cuda_graphs", "device_replay", "population", "resume", "parity", "learning")
@@ -42,8 +45,7 @@ TINY_SWEEP = ("--seeds", "1", "--eval-episodes", "1", "--set", "policy_kwargs=di
 TO_END = 45.0
 # States of a step in the list's record
 DONE, FAILED, STOPPED = "done", "failed", "stopped"
-# The exit code of a command that has reached its time limit
-TIME_OVER = 3
+RECORD = "gpu_list.json"
 
 Execute = Callable[[Sequence[str], Path, float], int]
 
@@ -56,11 +58,23 @@ class Step:
     :param name: its name, and that of its log
     :param command: the command line, after Python's name
     :param takes_minutes: whether the command has the option ``--minutes``
+    :param continues: whether the command, once stopped, goes on from what it has written
     """
 
     name: str
     command: tuple[str, ...]
     takes_minutes: bool = False
+    continues: bool = True
+
+    def recorded(self, record: dict[str, Any]) -> dict[str, Any]:
+        """
+        Return what a record says of this step.
+
+        :param record: the list's record
+        :return: its entry, empty if there is none, or if it is of another command
+        """
+        entry: dict[str, Any] = record.get(self.name, {})
+        return entry if entry.get("command") == list(self.command[1:]) else {}
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -75,20 +89,23 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("--minutes", type=float, help="end within this time (default: no limit)")
     parser.add_argument("--steps", type=count, default=300_000, help="environment steps of each run (default: %(default)s)")
-    parser.add_argument("--population", type=count, default=32, help="runs of one process at a time (default: %(default)s)")
+    parser.add_argument("--population", type=count, default=32, help="runs of one population, at most (default: %(default)s)")
     parser.add_argument("--workers", type=count, default=1, help="processes of each sweep (default: %(default)s)")
     parser.add_argument("--folder", type=output_folder, default="results/gpu_list", help="folder (default: %(default)s)")
     parser.add_argument("--only", nargs="+", help="names of steps to do (default: all)")
     parser.add_argument("--retry", action="store_true", help="do steps again that have failed")
-    parser.add_argument("--rehearse", action="store_true", help="do all of it on the CPU, with tiny sizes")
+    parser.add_argument("--rehearse", action="store_true", help="do all of it on the CPU, tiny, in --folder/rehearsal")
     parser.add_argument("--list", action="store_true", help="print the steps and their states, and do nothing")
     add_epilog(
         parser,
-        "examples:\n  python -m benchmark.gpu_list --minutes 9\n  python -m benchmark.gpu_list --rehearse --folder rehearsal",
+        "examples:\n  python -m benchmark.gpu_list --minutes 9\n  python -m benchmark.gpu_list --rehearse",
         "It takes hours of a GPU, in as many calls as are made.",
         "The same command continues. Logs, results, and the list's own record, gpu_list.json, are written to --folder.",
     )
-    return parser.parse_args(argv)
+    args = parser.parse_args(argv)
+    if args.rehearse:
+        args.folder = args.folder / "rehearsal"
+    return args
 
 
 def list_steps(args: argparse.Namespace) -> list[Step]:
@@ -99,29 +116,60 @@ def list_steps(args: argparse.Namespace) -> list[Step]:
     :return: the steps
     """
     python = (sys.executable, "-m")
-    files = [f"tests/test_{name}.py" for name in TESTS]
     # The tests with "graphs" in their names have a stand-in for a GPU
-    which = "recorded_gradient_steps" if args.rehearse else "gpu or graphs"
-    tests = (*python, "pytest", "-q", "-p", "no:cacheprovider", *(files[2:3] if args.rehearse else files), "-k", which)
+    names, which = (TESTS[2:3], "recorded_gradient_steps") if args.rehearse else (TESTS, "gpu or graphs")
+    pytest = (*python, "pytest", "-q", "-p", "no:cacheprovider", "-k", which)
     sizes = TINY if args.rehearse else ("--device", "cuda")
     population = (*python, "benchmark.population", "--folder", str(args.folder / "population"), *sizes)
     return [
-        Step("tests", tests),
+        *(Step(f"test_{name}", (*pytest, f"tests/test_{name}.py"), continues=False) for name in names),
         Step("population", population, takes_minutes=True),
         *(Step(name, (*python, "benchmark.sweep", *sweep_options(name, args))) for name in SWEEPS),
     ]
 
 
+def sweep_content(name: str) -> dict[str, Any]:
+    """
+    Return the content of a sweep's file: the paper's sweep, with CGP-Light among its methods.
+
+    :param name: the sweep
+    :return: the content
+    """
+    content: dict[str, Any] = yaml.safe_load((ROOT / "hyperparams" / "sweeps" / f"{name}.yml").read_text())
+    content["methods"] = list(dict.fromkeys([*content["methods"], LIGHT]))
+    return content
+
+
+def sweep_file(name: str, args: argparse.Namespace) -> Path:
+    """
+    Return the path of a sweep's file.
+
+    :param name: the sweep
+    :param args: the command line
+    :return: the path
+    """
+    return Path(args.folder / "sweeps" / f"{name}.yml")
+
+
+def write_sweep_files(args: argparse.Namespace) -> None:
+    """
+    Write the files of all sweeps.
+
+    :param args: the command line
+    """
+    for name in SWEEPS:
+        write_atomically(sweep_file(name, args), yaml.safe_dump(sweep_content(name), sort_keys=False).encode())
+
+
 def sweep_options(name: str, args: argparse.Namespace) -> list[str]:
     """
-    Return the arguments of a sweep, and write its file, which is the paper's with CGP-Light.
+    Return the arguments of a sweep.
 
     :param name: the sweep
     :param args: the command line
     :return: the arguments
     """
-    content = yaml.safe_load((ROOT / "hyperparams" / "sweeps" / f"{name}.yml").read_text())
-    content["methods"] = list(dict.fromkeys([*content["methods"], LIGHT]))
+    content, file = sweep_content(name), sweep_file(name, args)
     wanted = (*METHODS, *VARIANTS) if name == "e3" else METHODS
     methods = [method for method in wanted if method in content["methods"]]
     tasks, steps, device = list(content["tasks"]), args.steps, "cuda"
@@ -130,21 +178,12 @@ def sweep_options(name: str, args: argparse.Namespace) -> list[str]:
         tasks = list(OTHER_TASKS)
     if args.rehearse:
         methods, tasks, steps, device, further = ["CGP-Online", LIGHT], ["Pendulum-v1"], 40, "cpu", TINY_SWEEP
-    folder = args.folder / "sweeps"
-    folder.mkdir(parents=True, exist_ok=True)
-    file = folder / f"{name}.yml"
-    file.write_text(yaml.safe_dump(content, sort_keys=False))
+    folder = file.parent
     return [
         *(str(file), "--study", name, "--task", *tasks, "--steps", str(steps), "--methods", *methods, *further),
         *("--population", str(args.population), "--device", device, "--workers", str(args.workers)),
-        *(
-            "--storage",
-            f"sqlite:///{folder / 'studies.db'}",
-            "--logs",
-            str(folder / "logs"),
-            "--results",
-            str(folder / "results"),
-        ),
+        *("--storage", f"sqlite:///{folder / 'studies.db'}"),
+        *("--logs", str(folder / "logs"), "--results", str(folder / "results")),
     ]
 
 
@@ -162,18 +201,29 @@ def execute(command: Sequence[str], log: Path, seconds: float) -> int:
         try:
             return process.wait(seconds)
         except subprocess.TimeoutExpired:
-            # A sweep saves its runs' states
-            process.send_signal(signal.SIGTERM)
-            try:
-                process.wait(TO_END)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
             return TIME_OVER
-        except BaseException:
-            process.terminate()
-            process.wait()
-            raise
+        finally:
+            # Also where this process is interrupted, so that no step goes on without the list
+            end(process)
+
+
+def end(process: subprocess.Popen[bytes]) -> None:
+    """
+    Ask a process to end, and end it if it does not within :data:`TO_END` seconds.
+
+    :param process: the process, which may have ended
+    """
+    if process.poll() is not None:
+        return
+    try:
+        # A sweep saves its runs' states
+        process.send_signal(signal.SIGTERM)
+        process.wait(TO_END)
+    except subprocess.TimeoutExpired:
+        pass
+    finally:
+        process.kill()
+        process.wait()
 
 
 def do_steps(steps: Sequence[Step], args: argparse.Namespace, execute: Execute = execute) -> dict[str, Any]:
@@ -187,10 +237,11 @@ def do_steps(steps: Sequence[Step], args: argparse.Namespace, execute: Execute =
     """
     start = time.monotonic()
     limit = float("inf") if args.minutes is None else 60 * args.minutes - TO_END
-    path = args.folder / "gpu_list.json"
-    record: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    record = read_record(args)
+    is_first = True
     for step in steps:
-        state = record.get(step.name, {}).get("state")
+        earlier = step.recorded(record)
+        state = earlier.get("state")
         if state == DONE or (state == FAILED and not args.retry) or (args.only is not None and step.name not in args.only):
             print(f"{step.name}: {state or 'left out'}", flush=True)
             continue
@@ -206,11 +257,29 @@ def do_steps(steps: Sequence[Step], args: argparse.Namespace, execute: Execute =
         print(f"{step.name}: {' '.join(command[1:])}", flush=True)
         code = execute(command, args.folder / f"{step.name}.log", left)
         state = DONE if code == 0 else STOPPED if code == TIME_OVER else FAILED
-        seconds = record.get(step.name, {}).get("seconds", 0.0) + time.monotonic() - begin
-        record[step.name] = {"state": state, "seconds": round(seconds, 1), "exit_code": code, "command": command[1:]}
-        write_json(path, record)
+        if state == STOPPED and is_first and not step.continues:
+            # It had all of the time, and would take that of each further call
+            state = FAILED
+            print(f"{step.name} needs more time: give more --minutes, and --retry.")
+        is_first = False
+        seconds = earlier.get("seconds", 0.0) + time.monotonic() - begin
+        # Without its minutes, by which calls differ
+        entry = {"state": state, "seconds": round(seconds, 1), "exit_code": code, "command": list(step.command[1:])}
+        record[step.name] = entry
+        write_json(args.folder / RECORD, record)
         print(f"{step.name}: {state} after {seconds:.0f} s, see {args.folder / step.name}.log", flush=True)
     return record
+
+
+def read_record(args: argparse.Namespace) -> dict[str, Any]:
+    """
+    Return the list's record of earlier calls.
+
+    :param args: the command line
+    :return: the record, empty if there is none
+    """
+    path = args.folder / RECORD
+    return dict(json.loads(path.read_text())) if path.exists() else {}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -226,13 +295,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     if unknown:
         sys.exit(f"Error: --only {' '.join(unknown)}: must be of {', '.join(step.name for step in steps)}")
     if args.list:
-        path = args.folder / "gpu_list.json"
-        record = json.loads(path.read_text()) if path.exists() else {}
+        record = read_record(args)
         for step in steps:
-            print(f"{step.name}: {record.get(step.name, {}).get('state', 'to do')}: {' '.join(step.command[1:])}")
+            print(f"{step.name}: {step.recorded(record).get('state', 'to do')}: {' '.join(step.command[1:])}")
         return
+    # `sys.exit` ends the step, too
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    write_sweep_files(args)
     record = do_steps(steps, args)
-    if any(entry["state"] == FAILED for entry in record.values()):
+    if any(step.recorded(record).get("state") == FAILED for step in steps):
         sys.exit(1)
 
 

@@ -16,7 +16,7 @@ import torch as th
 
 from benchmark.common.arguments import continuous_environment, count
 from benchmark.common.files import write_json
-from benchmark.common.measuring import measuring_parser
+from benchmark.common.measuring import TIME_OVER, measuring_parser
 from benchmark.common.provenance import conditions
 from benchmark.speed.card_estimates import estimate_all
 from benchmark.speed.population_methods import METHODS
@@ -24,9 +24,9 @@ from benchmark.speed.population_points import measure_point, measure_product_rat
 from sb3_cgp.common.files import write_atomically
 from sb3_cgp.population.environments import available_cores
 
+# What is kept of an earlier call
+FOUND = ("points", "product_rate", "estimates")
 RECORDED = ("env", "seed", "rounds", "steps", "processes")
-# The exit code where the time is over before the last point
-TIME_OVER = 3
 NUMBERS = [1, 4, 8, 16, 32, 64]
 
 
@@ -70,17 +70,17 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     return args
 
 
-def kept_points(args: argparse.Namespace, given: dict[str, Any]) -> list[dict[str, Any]]:
+def kept(args: argparse.Namespace, given: dict[str, Any]) -> dict[str, Any]:
     """
-    Return the points of an earlier call, if it measured in the same way.
+    Return what an earlier call has found, if it measured in the same way.
 
     :param args: the command line
     :param given: the conditions of this call
-    :return: the points
+    :return: the points, and, where there are any, the device's rate and the estimates
     """
     path = args.folder / "population.json"
     if not path.exists():
-        return []
+        return {"points": []}
     record = json.loads(path.read_text())
 
     def way(record: dict[str, Any]) -> list[Any]:
@@ -88,7 +88,7 @@ def kept_points(args: argparse.Namespace, given: dict[str, Any]) -> list[dict[st
         return [*hardware, *(record[name] for name in RECORDED)]
 
     if not record["points"] or way(record) == way(given):
-        return list(record["points"])
+        return {name: record[name] for name in FOUND if name in record}
     sys.exit(f"Error: {path} was measured in another way, with {way(record)} in place of {way(given)}: give another --folder.")
 
 
@@ -123,7 +123,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parse(argv)
     th.set_num_threads(args.threads)
     record = conditions("benchmark.population", argv, args.device) | {name: getattr(args, name) for name in RECORDED}
-    record["points"] = kept_points(args, record)
+    record |= kept(args, record)
     if not args.only_estimate:
         record["product_rate"] = measure_product_rate(args.device)
     if args.estimate:

@@ -211,6 +211,22 @@ def test_points_that_are_there_are_kept_and_a_time_limit_ends_between_points(tmp
         population.main([*options, "--seed", "5"])
 
 
+def test_estimates_and_measurements_of_separate_calls_are_kept(tmp_path, small):
+    """With and without estimates, in both orders."""
+    options = [*TINY.split(), "--folder", str(tmp_path)]
+
+    def found(*further):
+        population.main([*options, *further])
+        record = json.loads((tmp_path / "population.json").read_text())
+        page = (tmp_path / "population.md").read_text()
+        return len(record["points"]), len(record["estimates"]["points"]), "/ alone" in page, "not measured" in page
+
+    assert found("--only-estimate") == (0, 2, False, True)
+    assert found("--no-estimate") == (3, 2, True, True)
+    assert found("--only-estimate") == (3, 2, True, True)
+    assert json.loads((tmp_path / "population.json").read_text())["product_rate"] == {"flops_per_second": 1e9, "size": 1}
+
+
 def test_without_the_packages_of_page_and_figure_the_record_is_written(tmp_path, small, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "benchmark.speed.population_page", None)
     population.main([*TINY.split(), "--only-estimate", "--folder", str(tmp_path)])

@@ -11,6 +11,7 @@ import pytest
 
 from benchmark import environments
 from benchmark.compatibility import check, checking
+from benchmark.compatibility import page as page_module
 from benchmark.compatibility.checking import summary
 from benchmark.compatibility.installing import install, read_pins
 from benchmark.compatibility.packages import PACKAGES, Environment, Learning, Package
@@ -30,6 +31,7 @@ case "$*" in
   *"pip install"*" hangs") sleep 60 ;;
   *"check.py stopped"*segfaults*) echo '{"doing": "stops", "errors": {}, "warnings": []}' > "$3/stopped.json"; kill -SEGV $$ ;;
   *"check.py whole"*sleeps*) sleep 60 & sleep 60 ;;
+  *"check.py whole"*aborts*) echo "$COMPLETE" > "$3/whole.json"; kill -ABRT $$ ;;
   *"check.py"*) echo "$WRITTEN" > "$3/$2.json" ;;
 esac
 """
@@ -69,6 +71,7 @@ def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path.chmod(0o755)
     monkeypatch.setenv("CALLS", str(tmp_path / "calls"))
     monkeypatch.setenv("WRITTEN", json.dumps(WRITTEN))
+    monkeypatch.setenv("COMPLETE", json.dumps(WRITTEN | {"complete": True}))
     return path
 
 
@@ -127,6 +130,51 @@ def test_named_packages_are_tested_and_the_others_kept(stand_in, fakes, tmp_path
     assert sum("check.py whole" in line and "sleeps" in line for line in (tmp_path / "calls").read_text().splitlines()) == 1
     with pytest.raises(SystemExit):
         run(stand_in, tmp_path, "--packages", "unknown")
+
+
+def test_a_crash_at_the_end_of_a_process_is_not_one_of_the_training(stand_in, tmp_path):
+    environment = Environment("aborts", "env = None")
+    for _ in range(2):
+        # The second check does not repeat the part
+        found = checking.check(environment, stand_in, tmp_path / "aborts", 10, reuse=True)
+        assert found["errors"] == {"whole": {"ends": "the process ended by SIGABRT"}}
+        assert found["resumes"] == "to the bit"
+        assert page_module._cells(environment, found)[:2] == ["yes", "to the bit"]
+
+
+def test_a_record_is_not_replaced_by_one_of_fewer_environments(stand_in, fakes, tmp_path, monkeypatch):
+    options = ("--packages", "shaky", "--timeout", "1")
+    before = run(stand_in, tmp_path, *options)["shaky"]
+    assert list(before["environments"]) == ["segfaults", "sleeps", "Fine-v0"]
+
+    def after(name, replacement):
+        with monkeypatch.context() as patch:
+            patch.setattr(environments, name, replacement)
+            try:
+                return run(stand_in, tmp_path, *options)["shaky"]
+            except KeyboardInterrupt:
+                return json.loads((tmp_path / "records" / "shaky.json").read_text())
+
+    assert after("install", lambda *_: {"failure": "no network"}) == before
+    found = iter([{"versions": {}, "resumes": None, "errors": {}}])
+
+    def interrupted(*_):
+        for each in found:
+            return each
+        raise KeyboardInterrupt
+
+    assert after("check", interrupted) == before
+    assert after("check", lambda *_: {"versions": {"works": "9"}, "resumes": None, "errors": {}})["versions"] == {"works": "9"}
+
+
+def test_a_record_that_lacks_an_environment_is_missing(stand_in, fakes, tmp_path):
+    options = ("--packages", "old", "shaky", "--timeout", "1", "--missing")
+    records = run(stand_in, tmp_path, *options)
+    del records["shaky"]["environments"]["Fine-v0"]
+    (tmp_path / "records" / "shaky.json").write_text(json.dumps(records["shaky"]))
+    (tmp_path / "calls").unlink()
+    assert "Fine-v0" in run(stand_in, tmp_path, *options)["shaky"]["environments"]
+    assert "Old-v0" not in (tmp_path / "calls").read_text()
 
 
 def test_a_page_may_be_elsewhere(stand_in, fakes, tmp_path):
@@ -354,6 +402,8 @@ def test_the_page_of_the_documentation_is_that_of_the_records():
     root = Path(__file__).parent.parent
     records = [json.loads(path.read_text()) for path in (root / "benchmark/results/environments").glob("*.json")]
     assert records
+    # Where the command writes it
+    assert f"`{environments.parse([]).folder / 'environments.md'}`" in page({})
     assert (root / "docs/tested_environments.md").read_text() == page({record["package"]: record for record in records})
 
 

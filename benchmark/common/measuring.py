@@ -11,6 +11,9 @@ from benchmark.common.arguments import add_epilog, count, device, output_folder
 from benchmark.common.files import publish
 from benchmark.common.provenance import conditions
 
+# The exit code of a command that has reached its time limit, as that of coreutils' `timeout`; pytest's own are 0 to 5
+TIME_OVER = 124
+
 
 def measuring_parser(
     name: str, description: str, with_seed: bool = True, example: str = "", duration: str = ""

@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from benchmark.common.files import write_json
 from benchmark.compatibility.packages import Environment
 from benchmark.compatibility.processes import execute
 from benchmark.compatibility.texts import in_a_line
@@ -41,7 +42,11 @@ def check(environment: Environment, python: Path, folder: Path, timeout: float, 
             ended = execute(command, folder, folder / f"{part}.log", timeout, HEADLESS)
             found[part] = _read(folder / f"{part}.json")
             if not ended.succeeded:
-                found[part]["errors"][found[part].get("doing") or "starts"] = f"the process ended by {ended.reason}"
+                # A simulator may crash when the interpreter ends
+                last = "ends" if found[part].get("complete") else found[part].get("doing") or "starts"
+                found[part]["errors"][last] = f"the process ended by {ended.reason}"
+                # For a check that is continued, and does not repeat the part
+                write_json(folder / f"{part}.json", found[part])
         # The same would stop the other parts
         if {"starts", "trains"} & found[part]["errors"].keys():
             break

@@ -13,9 +13,9 @@ TOP = """\
 # Tested environments
 
 CGP on the environments of other packages. Each package is installed from PyPI into a virtual environment of its own, and each
-environment is checked there. `make test-environments` does both, and writes this page. The `env` of a section's code is
-trained on by `CGP(policy, env)`, with the policy and the `replay_buffer_class` that the table names. [Your own
-environment](environments.md) says what CGP needs of one.
+environment is checked there. `make test-environments` does both, and writes its page, with the records, to
+`results/environments/environments.md`. The `env` of a section's code is trained on by `CGP(policy, env)`, with the policy and
+the `replay_buffer_class` that the table names. [Your own environment](environments.md) says what CGP needs of one.
 """
 NOTES = """\
 - **trains**: 220 steps by CGP's defaults (networks of 256 and 256 units, batches of 128) but for 110 random steps and a
