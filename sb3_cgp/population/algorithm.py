@@ -55,6 +55,8 @@ class Population(ResumableAlgorithm, PopulationMembers):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = CGP.policy_aliases
+    # For TensorBoard's tab HParams. SB3's attributes, such as `gamma`, have not the agents' values, which are in `agents`.
+    hyperparameter_names: ClassVar[tuple[str, ...]] = ("agents", "device")
 
     def __init__(
         self,
