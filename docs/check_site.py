@@ -18,7 +18,11 @@ LOADED = {"img": "src", "script": "src", "source": "src", "video": "src", "ifram
 
 
 class Page(HTMLParser):
-    """The anchors of a page, and the addresses that it links to and loads."""
+    """
+    The anchors of a page, the addresses that it links to and loads, and its figures.
+
+    :param path: the page's file
+    """
 
     def __init__(self, path: Path):
         super().__init__()
@@ -31,7 +35,12 @@ class Page(HTMLParser):
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Note the anchor of an element, and the address that it links to or loads."""
+        """
+        Note the anchor of an element, and the address that it links to or loads.
+
+        :param tag: the element's name, in lower case
+        :param attrs: its attributes by name; the value of an attribute without one is None
+        """
         attributes = dict(attrs)
         self.anchors |= {value for name in ("id", "name") if (value := attributes.get(name))}
         if tag == "a" and (address := attributes.get("href")):
@@ -43,12 +52,20 @@ class Page(HTMLParser):
         self.reading = attributes.get("id") if attributes.get("type") == "application/json" else None
 
     def handle_data(self, data: str) -> None:
-        """Keep the data of a figure."""
+        """
+        Keep the data of a figure.
+
+        :param data: text between two tags, or a part of it
+        """
         if self.reading is not None:
             self.data[self.reading] = self.data.get(self.reading, "") + data
 
     def handle_endtag(self, tag: str) -> None:
-        """End the data of a figure."""
+        """
+        End the data of a figure.
+
+        :param tag: the name of the element that ends, in lower case
+        """
         self.reading = None
 
 
@@ -57,6 +74,7 @@ def find_figure_faults(page: Page) -> Iterator[str]:
     Yield a line for every fault of a page's figures.
 
     :param page: the page
+    :return: the lines
     """
     for figure in page.figures:
         try:
@@ -75,6 +93,7 @@ def find_faults(folder: Path) -> Iterator[str]:
     Yield a line for every fault of the site.
 
     :param folder: the folder of the built site
+    :return: the lines
     """
     pages = {path.resolve(): Page(path) for path in sorted(folder.rglob("*.html"))}
     if not pages:
@@ -89,7 +108,12 @@ def find_faults(folder: Path) -> Iterator[str]:
 
 
 def is_external(address: str) -> bool:
-    """Return whether an address has a scheme or a host, so that it is not a file of the site; data within the page is none."""
+    """
+    Return whether an address has a scheme or a host, so that it is not a file of the site; data within the page is none.
+
+    :param address: the address
+    :return: whether it is external
+    """
     parts = urlsplit(address)
     return parts.scheme != "data" and bool(parts.scheme or parts.netloc)
 
@@ -100,7 +124,8 @@ def find_fault(path: Path, address: str, pages: dict[Path, Page]) -> str | None:
 
     :param path: the page that has the address
     :param address: a link, relative to the page
-    :param pages: all pages of the site
+    :param pages: all pages of the site, by their files
+    :return: the fault, if there is one
     """
     parts = urlsplit(address)
     if parts.scheme == "data":

@@ -24,7 +24,7 @@ def hyperparameters(model: BaseAlgorithm) -> dict[str, str | float]:
         stay numbers, and a schedule is its initial value. All else is text.
     """
     # An argument that the algorithm does not keep as an attribute cannot be read
-    names = inspect.signature(type(model).__init__).parameters.keys() - _LEFT_OUT
+    names = _argument_names(type(model)) - _LEFT_OUT
     values = {name: getattr(model, name) for name in sorted(names) if hasattr(model, name)}
     values |= {"algorithm": type(model), "policy": model.policy_class, "n_envs": model.n_envs}
     # The learning rates in effect: SB3's schedule for every form of the argument, and the actor's own where there is one
@@ -32,6 +32,30 @@ def hyperparameters(model: BaseAlgorithm) -> dict[str, str | float]:
         if name in values and hasattr(model, schedule):
             values[name] = getattr(model, schedule)
     return {name: _shown(value) for name, value in values.items()}
+
+
+def _argument_names(algorithm: type[BaseAlgorithm]) -> set[str]:
+    """
+    Return the names of the arguments that an algorithm's constructor takes, those that it passes on to its bases included.
+
+    :param algorithm: the algorithm's class. Its ``hyperparameter_names``, if it has them, stand for the names: a constructor
+        whose further arguments are no arguments of its bases declares them.
+    :return: the names
+    """
+    declared = getattr(algorithm, "hyperparameter_names", None)
+    if declared is not None:
+        return set(declared)
+    names: set[str] = set()
+    # In the order in which `super().__init__` goes through the constructors
+    for base in algorithm.__mro__:
+        if "__init__" not in vars(base):
+            continue
+        parameters = inspect.signature(vars(base)["__init__"]).parameters.values()
+        own = {each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+        names |= own
+        if len(own) == len(parameters):
+            break
+    return names
 
 
 def _shown(value: Any) -> str | float:

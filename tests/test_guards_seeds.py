@@ -8,6 +8,11 @@ from guarded import SMALL, GuardedTD3, located
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor, VecNormalize
 
 from sb3_cgp import CGP
+from sb3_cgp.guards import GuardedAlgorithm
+from sb3_cgp.guards.losses import LossGuard
+from sb3_cgp.guards.networks import NetworkGuard
+from sb3_cgp.guards.normalisation import NormalisationGuard
+from sb3_cgp.population import Population
 
 
 class Pool:
@@ -44,6 +49,42 @@ def test_environments_that_cannot_be_seeded_are_trained_on(algorithm, wrap):
         again = algorithm("MlpPolicy", wrap(Adapter(Pool())), **SMALL)
     again.learn(20)
     np.testing.assert_array_equal(again.action_space.sample(), actions[0])
+
+
+class Bare(Pool):
+    """Has nothing that SB3's environments alone have."""
+
+    def __getattr__(self, name):
+        if name in ("seed", "unwrapped", "_seeds"):
+            raise AttributeError(name)
+        return super().__getattr__(name)
+
+
+@pytest.mark.parametrize("pool", [Pool, Bare])
+def test_a_population_takes_environments_that_cannot_be_seeded(pool):
+    with pytest.warns(UserWarning, match=rf"{pool.__name__} has no method `seed`"):
+        population = Population("MlpPolicy", VecMonitor(Adapter(pool())), 2, cem_samples=6, cem_elites=2, **SMALL)
+    assert population.learn(20).num_timesteps == 20
+
+
+def test_a_population_has_all_guards_but_those_that_its_agents_need():
+    not_its_own = {LossGuard, NetworkGuard, NormalisationGuard}
+    assert {*GuardedAlgorithm.__bases__} - {*Population.__mro__} == not_its_own
+
+
+@pytest.mark.parametrize("algorithm", [CGP, lambda *args, **kwargs: Population(*args, 2, **kwargs)])
+def test_a_model_without_a_seed_leaves_the_environments_theirs(algorithm):
+    env = located(2)
+    env.seed(7)
+    algorithm("MlpPolicy", env, **(SMALL | dict(seed=None)))
+    assert env._seeds == [7, 8]
+
+
+def test_an_agent_without_a_seed_leaves_its_environment_the_seed_it_has():
+    env = located(3)
+    env.seed(7)
+    Population("MlpPolicy", env, [dict(seed=0), dict(seed=None), dict(seed=90)], **SMALL)
+    assert env._seeds == [0, 8, 90]
 
 
 def test_without_a_seed_or_with_the_method_there_is_no_warning():

@@ -20,6 +20,9 @@ from tensorboard.plugins.hparams.get_experiment import Handler as ExperimentHand
 from tensorboard.plugins.hparams.list_session_groups import Handler as SessionsHandler
 
 from sb3_cgp import CGP, HParamsCallback, Selection
+from sb3_cgp.hparams import hyperparameters
+from sb3_cgp.population import Population
+from sb3_cgp.resumption.algorithm import resumable
 from sb3_cgp.zoo import register
 
 
@@ -115,6 +118,41 @@ def test_on_policy_algorithms(tmp_path):
     model.learn(8, HParamsCallback())
     (row,) = Tab(tmp_path).rows()
     assert (row["algorithm"], row["n_steps"], row["clip_range"], row["learning_rate"]) == ("PPO", 8, 0.2, 3e-4)
+
+
+class PassingAll(CGP):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+
+
+class PassingPositional(TD3):
+    def __init__(self, *args):
+        super().__init__(*args)
+
+
+class WithAnother(PassingAll):
+    def __init__(self, policy, env, kwargs=3, **others):
+        super().__init__(policy, env, **others)
+        self.kwargs = kwargs
+
+
+@pytest.mark.parametrize(
+    ("derived", "algorithm", "further"),
+    [
+        (PassingAll, CGP, {}), (PassingPositional, TD3, {}), (WithAnother, CGP, {"kwargs": 3.0}),
+        (resumable(TD3), TD3, {}), (resumable(PassingAll), CGP, {}),
+    ],
+)  # fmt: skip
+def test_arguments_that_a_subclass_passes_on_are_shown(derived, algorithm, further):
+    ours, theirs = (hyperparameters(each("MlpPolicy", "Pendulum-v1")) for each in (derived, algorithm))
+    assert ours == theirs | further | {"algorithm": derived.__name__}
+
+
+def test_a_population_shows_its_agents_and_no_attribute_of_sb3s():
+    population = Population("MlpPolicy", "Pendulum-v1", [dict(gamma=0.5), dict(gamma=0.6)], **tiny())
+    shown = hyperparameters(population)
+    assert shown.keys() == {"agents", "device", "algorithm", "policy", "n_envs"}
+    assert "'gamma': 0.6" in shown["agents"]
 
 
 class Failing(BaseCallback):

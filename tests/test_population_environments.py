@@ -1,5 +1,7 @@
 """Environments of a population in a few processes: they return what a ``DummyVecEnv`` returns, to the bit."""
 
+import multiprocessing
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -127,6 +129,23 @@ def test_the_methods_of_a_vec_env_reach_the_right_environments(closing):
     assert not ours.has_attr("no_such_attribute")
 
 
+@pytest.mark.parametrize("indices", [5, -6, [0, 7], np.array([-9])])
+def test_indices_out_of_range_are_refused_as_by_a_dummy_vec_env(indices, closing):
+    for env in (reference(), closing(make())):
+        for call in (
+            lambda env: env.get_attr("spec", indices),
+            lambda env: env.set_attr("mark", "wrong", indices),
+            lambda env: env.env_method("get_wrapper_attr", "spec", indices=indices),
+            lambda env: env.env_is_wrapped(Monitor, indices),
+        ):
+            with pytest.raises(IndexError):
+                call(env)
+        # No environment was changed, and no answer is left unread
+        assert not env.has_attr("mark")
+    with pytest.raises(IndexError, match=r"`indices` is .*, but must be indices of the 5 environments, from -5 to 4"):
+        env.get_attr("spec", indices)
+
+
 class Named(Doubles):
     """Observations by name."""
 
@@ -175,6 +194,45 @@ def test_numbers_of_processes_that_do_not_fit_are_refused_by_name(n_processes):
     for refused in (make, lambda n_processes: ChunkedSubprocVecEnv([Doubles] * 5, n_processes)):
         with pytest.raises(ValueError, match="n_processes"):
             refused(n_processes=n_processes)
+
+
+def test_arguments_that_do_not_fit_are_refused_by_name():
+    for n_processes in (1, 2):
+        for arguments in (dict(vec_env_cls=SubprocVecEnv), dict(vec_env_kwargs={})):
+            (name,) = arguments
+            with pytest.raises(ValueError, match=f"`{name}` .* but must be left out: `n_processes` chooses the class"):
+                make(n_processes=n_processes, **arguments)
+        with pytest.raises(ValueError, match=r"`start_method` is 'nonsense', but must be one of .*'spawn'"):
+            make_population_env("Pendulum-v1", 2, n_processes, start_method="nonsense")
+    with pytest.raises(ValueError, match="`start_method` is 'nonsense'"):
+        ChunkedSubprocVecEnv([Doubles] * 2, 2, "nonsense")
+    with pytest.raises(ValueError, match=r"`env_fns` is \[\], but must be a sequence of at least one function"):
+        ChunkedSubprocVecEnv([])
+
+
+def fail():
+    raise ZeroDivisionError
+
+
+@pytest.mark.parametrize("failing", [0, 2])
+def test_a_process_that_ends_before_its_environments_are_made_is_named(failing, capfd):
+    makers = [Doubles] * 4
+    makers[failing] = fail
+    message = (
+        rf"Process {failing // 2} of 2 ended with exit code 1 .* the indices {failing} to {failing + 1}\. .*`n_processes=1`"
+    )
+    with pytest.raises(RuntimeError, match=message):
+        ChunkedSubprocVecEnv(makers, 2, "fork")
+    assert "ZeroDivisionError" in capfd.readouterr().err
+    assert multiprocessing.active_children() == []
+
+
+def test_an_unknown_environment_is_named_from_a_process_too(capfd):
+    with pytest.raises(RuntimeError, match=r"Process 0 of 2 ended .*raises that error"):
+        make_population_env("Pendulm-v1", 2, 2, **FORK)
+    assert "Environment `Pendulm` doesn't exist" in capfd.readouterr().err
+    with pytest.raises(gym.error.NameNotFound):
+        make_population_env("Pendulm-v1", 2, 1)
 
 
 def test_restored_environments_go_on_to_the_bit(closing):

@@ -2,6 +2,8 @@
 
 import re
 import runpy
+import sys
+from types import SimpleNamespace
 
 import pytest
 from examples import ROOT, python_examples, run_in_order
@@ -70,6 +72,17 @@ def test_every_public_name_is_documented_once():
     modules = (sb3_cgp, sb3_cgp.population, sb3_cgp.resumption, sb3_cgp.selectors, sb3_cgp.zoo)
     public = {name for module in modules for name in module.__all__} - {"__version__"}
     assert sorted(documented) == sorted(public)
+
+
+def test_the_page_of_curves_is_read_at_every_build(monkeypatch):
+    # Sphinx is no requirement of the tests: of the module, the extension needs a name for annotations
+    pytest.importorskip("plotly")
+    monkeypatch.setitem(sys.modules, "sphinx.application", SimpleNamespace(Sphinx=object))
+    extension = runpy.run_path(str(ROOT / "docs" / "site_curves.py"))
+    handlers = {}
+    extension["setup"](SimpleNamespace(config=SimpleNamespace(html_static_path=[]), connect=handlers.__setitem__))
+    (page,) = handlers["env-get-outdated"](None, None, set(), set(), set())
+    assert (ROOT / f"{page}.md").read_text().count(extension["MARK"]) == 1
 
 
 CHECK = runpy.run_path(str(ROOT / "docs" / "check_site.py"))["find_faults"]

@@ -37,7 +37,11 @@ class Way:
     package: str | None = None
 
     def reason_missing(self) -> str | None:
-        """Return why the way cannot be measured; None if it can."""
+        """
+        Return why the way cannot be measured.
+
+        :return: the reason; None if it can be measured
+        """
         try:
             if self.package is not None:
                 importlib.import_module(self.package)
@@ -61,17 +65,29 @@ class AdaptedVecEnv(VecEnv):
         super().__init__(n_envs, *spaces)
 
     def reset(self) -> np.ndarray:
-        """Reset the environments, and return the observations."""
+        """
+        Reset the environments.
+
+        :return: observations
+        """
         observations, _ = self._env.reset() if self._seed is None else self._env.reset(seed=self._seed)
         self._seed = None
         return np.asarray(observations)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Remember the actions: the next call takes the step."""
+        """
+        Remember the actions: the next call takes the step.
+
+        :param actions: an action of each environment
+        """
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Take a step, and return observations, rewards, ends of episodes and infos."""
+        """
+        Take a step.
+
+        :return: observations, rewards, ends of episodes and infos
+        """
         observations, rewards, terminations, truncations, info = self._env.step(self._actions)
         dones = terminations | truncations
         infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
@@ -89,21 +105,48 @@ class AdaptedVecEnv(VecEnv):
         self._env.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return None for each environment: SB3 asks for the mode of rendering."""
+        """
+        Return None for each environment: SB3 asks for the mode of rendering.
+
+        :param attr_name: the attribute's name
+        :param indices: the environments; None for all
+        :return: None for each of them
+        """
         return [None for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Refuse to set an attribute."""
+        """
+        Refuse to set an attribute.
+
+        :param attr_name: the attribute's name
+        :param value: its value
+        :param indices: the environments; None for all
+        :raises NotImplementedError: always
+        """
         raise NotImplementedError
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Refuse to call a method."""
+        """
+        Refuse to call a method.
+
+        :param method_name: the method's name
+        :param method_args: its arguments
+        :param indices: the environments; None for all
+        :param method_kwargs: its keyword arguments
+        :raises NotImplementedError: always
+        """
         raise NotImplementedError
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """Return False for each environment: SB3 asks for ``Monitor``."""
+        """
+        Return False for each environment: SB3 asks for ``Monitor``.
+
+        :param wrapper_class: the wrapper
+        :param indices: the environments; None for all
+        :return: False for each of them
+        """
         return [False for _ in self._get_indices(indices)]
 
 

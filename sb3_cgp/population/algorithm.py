@@ -15,6 +15,7 @@ from sb3_cgp.algorithm import CGP
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import as_schedule
 from sb3_cgp.core.policies import CGPPolicy
+from sb3_cgp.guards.observations import innermost
 from sb3_cgp.population.agents import (
     COMMON,
     OWN,
@@ -54,6 +55,8 @@ class Population(ResumableAlgorithm, PopulationMembers):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = CGP.policy_aliases
+    # For TensorBoard's tab HParams. SB3's attributes, such as `gamma`, have not the agents' values, which are in `agents`.
+    hyperparameter_names: ClassVar[tuple[str, ...]] = ("agents", "device")
 
     def __init__(
         self,
@@ -124,11 +127,14 @@ class Population(ResumableAlgorithm, PopulationMembers):
 
         :param seed: the seed of the generators that the agents share
         """
+        # Not `env.unwrapped`, which an environment of no class of SB3's may lack
+        env = innermost(self.env)
+        seeds_before = [] if env is None else list(env._seeds)
         super().set_random_seed(seed)
-        if self.env is not None:
-            for index, arguments in enumerate(self.agents):
-                # SB3 counts the environments' seeds from one number
-                self.env.unwrapped._seeds[index] = arguments.get("seed")
+        if env is not None:
+            # SB3 counts the environments' seeds from one number. As with CGP alone, no seed leaves the environment's own.
+            own = [arguments.get("seed") for arguments in self.agents]
+            env._seeds = [before if each is None else each for each, before in zip(own, seeds_before, strict=True)]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
         # `set_env` may have changed it

@@ -3,7 +3,7 @@
 import multiprocessing as mp
 import os
 from collections.abc import Callable, Sequence
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +12,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_cgp.common.rules import require, require_count
+from sb3_cgp.common.rules import require, require_choice, require_count
+from sb3_cgp.guards.workers import GRACE, end_workers
 from sb3_cgp.resumption.environments import RestorableEnv
 
 
@@ -48,9 +49,14 @@ def make_population_env(
     :param start_method: how processes are started, see :class:`ChunkedSubprocVecEnv`
     :param kwargs: the further arguments of ``make_vec_env``, such as ``env_kwargs``
     :return: the environments
-    :raises ValueError: if a number is out of its range
+    :raises ValueError: if a number is out of its range, or the start method or an argument is not allowed
+    :raises RuntimeError: if a process ends before it has made its environments
     """
+    for name in ("vec_env_cls", "vec_env_kwargs"):
+        allowed = "left out: `n_processes` chooses the class; SB3's `make_vec_env` makes environments of another one"
+        require(name not in kwargs, name, kwargs.get(name), allowed)
     require_count("n_agents", n_agents)
+    check_start_method(start_method)
     if n_processes is None:
         n_processes = min(available_cores(), n_agents)
     check_processes(n_processes, n_agents)
@@ -77,6 +83,17 @@ def check_processes(n_processes: int, n_envs: int) -> None:
     require(n_processes <= n_envs, "n_processes", n_processes, f"at most {n_envs}, the number of environments")
 
 
+def check_start_method(start_method: str | None) -> None:
+    """
+    Check how processes are to be started.
+
+    :param start_method: the start method; None for the default
+    :raises ValueError: if this platform does not have it
+    """
+    if start_method is not None:
+        require_choice("start_method", start_method, mp.get_all_start_methods())
+
+
 def chunk_bounds(n_envs: int, n_processes: int) -> list[tuple[int, int]]:
     """
     Share environments out among processes, in order, as evenly as possible.
@@ -100,7 +117,8 @@ class ChunkedSubprocVecEnv(SubprocVecEnv):
     :param env_fns: functions that make the environments
     :param n_processes: number of processes, at most as many as environments; None for one for each available core
     :param start_method: "forkserver", "spawn" or "fork", see SB3's ``SubprocVecEnv``
-    :raises ValueError: if the number of processes is out of its range
+    :raises ValueError: if there is no function, the number of processes is out of its range, or there is no such start method
+    :raises RuntimeError: if a process ends before it has made its environments
     """
 
     def __init__(
@@ -108,6 +126,8 @@ class ChunkedSubprocVecEnv(SubprocVecEnv):
     ):
         # Not SubprocVecEnv's constructor, which starts a process for each environment
         n_envs = len(env_fns)
+        require(n_envs > 0, "env_fns", env_fns, "a sequence of at least one function")
+        check_start_method(start_method)
         n_processes = min(available_cores(), n_envs) if n_processes is None else n_processes
         check_processes(n_processes, n_envs)
         self.waiting = self.closed = False
@@ -124,8 +144,35 @@ class ChunkedSubprocVecEnv(SubprocVecEnv):
             process.start()
             self.processes.append(process)
             work_remote.close()
-        self.remotes[0].send(("get_spaces", None))
-        VecEnv.__init__(self, n_envs, *self.remotes[0].recv())
+        VecEnv.__init__(self, n_envs, *self._receive_spaces())
+
+    def _receive_spaces(self) -> tuple[gym.Space, gym.Space]:
+        """
+        Wait until all processes have made their environments.
+
+        :return: observation and action space
+        :raises RuntimeError: if a process has ended before; the others are ended too
+        """
+        spaces = []
+        for index, (remote, process) in enumerate(zip(self.remotes, self.processes, strict=True)):
+            try:
+                remote.send(("get_spaces", None))
+                # A forked process inherits the others' ends of pipes, so that the end of a pipe does not tell of every death
+                if remote not in wait([remote, process.sentinel]):
+                    raise EOFError
+                spaces.append(remote.recv())
+            except (EOFError, ConnectionError) as error:
+                process.join(GRACE)
+                code = process.exitcode
+                end_workers(self)
+                start, stop = self._bounds[index]
+                raise RuntimeError(
+                    f"Process {index} of {len(self.processes)} ended with exit code {code} before it had made its "
+                    f"environments, with the indices {start} to {stop - 1}. Its own error is printed above; "
+                    "`make_population_env` with `n_processes=1` makes them in this process and raises that error. "
+                    "The other processes were ended too."
+                ) from error
+        return spaces[0]
 
     def step_async(self, actions: np.ndarray) -> None:
         """
@@ -216,16 +263,30 @@ class ChunkedSubprocVecEnv(SubprocVecEnv):
         """
         return self._ask("env_is_wrapped", indices, wrapper_class)
 
+    def _positions(self, indices: VecEnvIndices) -> list[int]:
+        """
+        Return the positions of some of the environments, counted from the first one.
+
+        :param indices: the environments, negative indices from the last one; None for all
+        :return: the positions
+        :raises IndexError: if an index is out of range, as in a ``DummyVecEnv``
+        """
+        try:
+            return [range(self.num_envs)[index] for index in self._get_indices(indices)]
+        except IndexError as error:
+            allowed = f"indices of the {self.num_envs} environments, from {-self.num_envs} to {self.num_envs - 1}"
+            raise IndexError(f"The value of `indices` is {indices!r}, but must be {allowed}.") from error
+
     def _get_target_remotes(self, indices: VecEnvIndices) -> list[Any]:
         """Return the connections of the processes that some of the environments are in, for SB3's ``has_attr``."""
-        wanted = {index % self.num_envs for index in self._get_indices(indices)}
+        wanted = set(self._positions(indices))
         pairs = zip(self._bounds, self.remotes, strict=True)
         return [remote for (start, stop), remote in pairs if not wanted.isdisjoint(range(start, stop))]
 
     def _ask(self, method: str, indices: VecEnvIndices, *args: Any, **kwargs: Any) -> list[Any]:
         """Call a method of each process's ``DummyVecEnv`` for some of the environments, and return a value of each."""
         answers: dict[int, Any] = {}
-        wanted = [index % self.num_envs for index in self._get_indices(indices)]
+        wanted = self._positions(indices)
         asked = []
         for (start, stop), remote in zip(self._bounds, self.remotes, strict=True):
             own = [index for index in dict.fromkeys(wanted) if start <= index < stop]

@@ -16,6 +16,8 @@ from sb3_cgp.guards.episodes import EpisodeGuard
 from sb3_cgp.guards.explanations import ExplanationGuard
 from sb3_cgp.guards.learning_starts import LearningStartsGuard
 from sb3_cgp.guards.parts import PartsGuard
+from sb3_cgp.guards.paths import PathGuard
+from sb3_cgp.guards.seeds import SeedGuard
 from sb3_cgp.guards.transitions import TransitionGuard
 from sb3_cgp.guards.workers import WorkerGuard
 from sb3_cgp.population.agents import Arguments
@@ -31,6 +33,8 @@ LOSSES = ("critic_loss", "q_value", "actor_loss")
 
 class PopulationTraining(
     # CGP's guards, but for those of networks, losses and VecNormalize: each agent's own CGP has tried its networks
+    PathGuard,
+    SeedGuard,
     WorkerGuard,
     ExplanationGuard,
     DummyVecEnvGuard,
