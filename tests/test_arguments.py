@@ -41,6 +41,8 @@ EMPTY = spaces.Box(np.ones(1, np.float32), np.ones(1, np.float32))
         (dict(gamma=-0.1), r"`gamma` is -0.1, but must be a number within \[0, 1\]"),
         (dict(target_policy_noise=-0.2), "`target_policy_noise` is -0.2, but must be a finite number >= 0"),
         (dict(target_noise_clip=np.nan), "`target_noise_clip` is nan, but must be a finite number >= 0"),
+        (dict(action_noise=0.1), "`action_noise` is 0.1, but must be None or an ActionNoise, such as NormalActionNoise"),
+        (dict(action_noise="normal"), "`action_noise` is 'normal', but must be None or an ActionNoise"),
         (dict(action_noise=NormalActionNoise(np.zeros(1), -np.ones(1))), "`action_noise` is .* standard deviation >= 0"),
         (dict(learning_rate=-1e-3), "`learning_rate` is -0.001, but must be a finite number >= 0"),
         (dict(actor_learning_rate="fast"), "`actor_learning_rate` is 'fast', but must be a number >= 0, a schedule, or"),

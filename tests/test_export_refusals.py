@@ -108,6 +108,15 @@ def test_what_cannot_be_exported_is_named(change, message, tmp_path):
     assert not (tmp_path / "export").exists()
 
 
+@pytest.mark.parametrize("name", ["policy.onnx", "policy.safetensors", "policy.zip"])
+def test_a_file_in_place_of_the_folder_is_refused(name, tmp_path):
+    with pytest.raises(
+        ValueError, match=rf"(?s)`folder` is '.*{name}', but must be the name of a folder, in which policy.onnx"
+    ):
+        make_model().export(tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_policy_that_acts_otherwise_than_its_network_is_not_exported(tmp_path):
     model = make_model()
     model.actor.mu[0].register_forward_hook(lambda layer, inputs, output: output + 1.0)

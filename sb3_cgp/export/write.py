@@ -42,6 +42,9 @@ from sb3_cgp.export.onnx_file import make_onnx, named_inputs, run_onnx
 from sb3_cgp.export.policy import ExportedPolicy
 from sb3_cgp.export.read import PURPOSE, build
 
+# Of files, which a user may name in place of the folder
+SUFFIXES = (".onnx", ".safetensors", ".json", ".zip")
+
 # Observations at which an export is compared with `predict`
 CHECKED_OBSERVATIONS = 16
 
@@ -74,10 +77,12 @@ def export_policy(model: ExportableModel, folder: str | Path) -> None:
 
     :param model: the model
     :param folder: the folder for the files; it is created if it is missing
-    :raises ValueError: if the policy cannot be exported, naming the obstacle and what is allowed
+    :raises ValueError: if the policy cannot be exported, or the folder has the name of a file; it says what is allowed
     :raises FileExistsError: if the folder is a file
     :raises ImportError: if a package of the ``export`` extra is not installed
     """
+    allowed = "the name of a folder, in which policy.onnx is written, such as 'exported_policy'"
+    require(Path(folder).suffix not in SUFFIXES, "folder", str(folder), allowed)
     if Path(folder).is_file():
         raise FileExistsError(errno.EEXIST, "Is a file, and must be a folder or a new name", str(folder))
     # Before anything is computed

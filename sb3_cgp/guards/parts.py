@@ -33,6 +33,9 @@ class PartsGuard(OffPolicyAlgorithm):
         return wrapped
 
     def _setup_model(self) -> None:
+        allowed = "None or an ActionNoise, such as NormalActionNoise(np.zeros(n), 0.1 * np.ones(n)) for n action dimensions"
+        is_noise = self.action_noise is None or isinstance(self.action_noise, ActionNoise)
+        require(is_noise, "action_noise", self.action_noise, allowed)
         is_her = isinstance(self.replay_buffer_class, type) and issubclass(self.replay_buffer_class, HerReplayBuffer)
         if self.env is not None or self.replay_buffer is not None or not is_her:
             super()._setup_model()
