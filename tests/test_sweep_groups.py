@@ -3,6 +3,7 @@
 from collections import Counter
 
 import pytest
+import torch as th
 import yaml
 from optuna.storages import InMemoryStorage
 from optuna.trial import TrialState
@@ -10,6 +11,7 @@ from studies import (
     GRACE,
     Clock,
     Crew,
+    Heart,
     assert_each_run_once,
     make_sweep,
     mortal,
@@ -331,16 +333,78 @@ def test_a_group_that_fails_as_a_whole_is_trained_run_by_run(clock, tmp_path, mo
     }  # fmt: skip
 
 
-def test_what_the_machine_lacks_gives_a_group_back(clock, tmp_path, monkeypatch):
+@pytest.mark.parametrize("lack", [MemoryError, getattr(th, "AcceleratorError", th.OutOfMemoryError), ChildProcessError])
+def test_what_the_machine_lacks_gives_a_group_back(clock, tmp_path, monkeypatch, lack):
     storage = InMemoryStorage()
 
     def train_group(*args):
-        raise MemoryError
+        raise lack
 
     with monkeypatch.context() as patch:
         patch.setattr(worker, "train_group", train_group)
-        with pytest.raises(MemoryError):
+        with pytest.raises(lack):
             work_through(storage, make_sweep(), clock, tmp_path, population=8)
     assert Counter(trial.state for trial in trials_of(storage)) == {TrialState.FAIL: 4, TrialState.WAITING: 4}
     work_through(storage, make_sweep(), clock, tmp_path, population=8)
     assert_each_run_once(trials_of(storage), make_sweep())
+
+
+@pytest.mark.parametrize("population", [1, 8])
+def test_states_that_a_killed_process_has_left_are_removed_at_the_end_of_the_study(clock, tmp_path, monkeypatch, population):
+    def train(run, folder, *args):
+        begin(run, folder)
+        StateStore(folder / "state").save(1, {})
+        return pretend_to_train(run, folder, *args)
+
+    def killed(*args):
+        raise SystemExit
+
+    storage, sweep = InMemoryStorage(), make_sweep(["Good"])
+    monkeypatch.setattr(worker, "train", train)
+    with monkeypatch.context() as patch:
+        patch.setattr(worker, "_forget", killed)
+        for _ in range(2):
+            with pytest.raises(SystemExit):
+                work_through(storage, sweep, clock, tmp_path, population)
+            if population > 1:
+                break
+    assert list(tmp_path.rglob("state-*.json"))
+    work_through(storage, sweep, clock, tmp_path, population)
+    assert_each_run_once(trials_of(storage), sweep)
+    assert not list(tmp_path.rglob("state-*.json"))
+
+
+def test_states_are_removed_before_another_process_may_continue_from_them(clock, tmp_path, monkeypatch):
+    events = []
+
+    class Lock:
+        def __init__(self, path):
+            events.append("locked")
+
+        def __enter__(self):
+            pass
+
+        def __exit__(self, *exception):
+            events.append("released")
+
+    forget = worker._forget
+    monkeypatch.setattr(worker, "FileLock", Lock)
+    monkeypatch.setattr(worker, "_forget", lambda *args: events.append("removed") or forget(*args))
+    work_through(InMemoryStorage(), make_sweep(["Good"]), clock, tmp_path, population=8)
+    assert events == ["locked", "locked", "removed", "released", "released"]
+
+
+def test_a_process_that_was_taken_for_lost_leaves_the_states_to_its_successor(ledger, tmp_path, monkeypatch):
+    def train_group(group, folders, claimed, watch, device):
+        group.write()
+        StateStore(group.states).save(1, {})
+        for trial in ledger.trials():
+            if trial.state is TrialState.RUNNING:
+                ledger._end(ledger._id(trial), TrialState.FAIL, outcome="lost")
+        raise RuntimeError("an error of its own")
+
+    claims, group, _ = claim(ledger, tmp_path, 8)
+    monkeypatch.setattr(worker, "train_group", train_group)
+    monkeypatch.setattr(worker, "HeartbeatThread", Heart)
+    worker._train_claimed(ledger, claims, group, tmp_path, 1.0, None, "cpu")
+    assert StateStore(group.states).steps() == [1]

@@ -6,22 +6,25 @@ import random
 import signal
 import time
 from dataclasses import fields
+from functools import partial
 
 import numpy as np
 import pytest
 import torch as th
 import yaml
+from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from optuna.storages import InMemoryStorage
 from rl_zoo3 import ALGOS
 from test_population import float64  # noqa: F401  # a fixture
 from test_sweep_kills import Study
 from test_sweep_run import Interruption, interrupt_at, policy_of, trained
 
-from benchmark.common.records import Record
+from benchmark.common.records import EVALUATION_SEED, Record
 from benchmark.reporting.figures import figures
 from benchmark.reporting.run_curves import read_curve
 from benchmark.reporting.zoo_runs import run_in
 from benchmark.sweeps import population_run
+from benchmark.sweeps.environment_processes import close_environments
 from benchmark.sweeps.execution import describe
 from benchmark.sweeps.experiments import load_sweep
 from benchmark.sweeps.exports import export_study
@@ -281,6 +284,93 @@ def test_a_sweep_by_populations_has_the_runs_and_the_page_of_one_without(tmp_pat
     paths = [sorted(run.name for run in (tmp_path / size / "logs").glob("tiny/*/*/*")) for size in ("1", "8")]
     assert paths[0] == paths[1]
     assert not list((tmp_path / "8" / "logs" / "tiny" / "populations").iterdir())
+
+
+class Ending:
+    """
+    Lets ``Pendulum-v1`` end its own process, where that is not the test's.
+
+    :param how: a signal, or None for an exception
+    :param when: the environment's step: 35 is in the training, 70 in its first evaluation. None is the final evaluation.
+    """
+
+    def __init__(self, monkeypatch, how, when):
+        self.how, self.process = how, os.getpid()
+        reset, step, ending = PendulumEnv.reset, PendulumEnv.step, self
+
+        def ending_reset(self, *, seed=None, options=None):
+            ending.end(when is None and seed == EVALUATION_SEED)
+            return reset(self, seed=seed, options=options)
+
+        def ending_step(self, action):
+            self.steps = getattr(self, "steps", 0) + 1
+            ending.end(self.steps == when)
+            return step(self, action)
+
+        monkeypatch.setattr(PendulumEnv, "reset", ending_reset)
+        monkeypatch.setattr(PendulumEnv, "step", ending_step)
+
+    def end(self, now):
+        if now and os.getpid() != self.process:
+            if self.how is None:
+                raise ValueError("the simulator's own error")
+            os.kill(os.getpid(), self.how)
+
+
+def in_processes(monkeypatch):
+    """Step environments in other processes, as on a GPU. SB3's default method of starting them takes long."""
+    monkeypatch.setattr(population_run, "get_device", lambda device: th.device("cuda"))
+    fork = partial(ChunkedSubprocVecEnv, n_processes=2, start_method="fork")
+    monkeypatch.setattr(population_run, "ChunkedSubprocVecEnv", fork)
+
+
+@pytest.mark.parametrize(("how", "when"), [(None, 35), (None, None), (signal.SIGABRT, 70)])
+def test_an_environment_that_ends_its_own_process_dissolves_the_population(tmp_path, monkeypatch, how, when):
+    in_processes(monkeypatch)
+    Ending(monkeypatch, how, when)
+    ledger = study_of(write_sweep(tmp_path, {"A": ("td3", {})}, steps=90), 8, tmp_path / "logs")
+    outcomes = [trial.user_attrs.get("outcome", "") for trial in ledger.trials()]
+    assert [outcome.partition(":")[0] for outcome in outcomes] == ["dissolved"] * 2 + [""] * 2
+    assert ("exit code 1" if how is None else "signal 6") in outcomes[0]
+    # Alone, a run is trained in this process
+    assert [record.error for record in ledger.records()] == [None, None]
+
+
+@pytest.mark.parametrize(
+    ("how", "error", "when"),
+    [(signal.SIGKILL, ChildProcessError, when) for when in (35, 70, None)] + [(signal.SIGTERM, SystemExit, 35)],
+)
+def test_a_population_whose_environments_are_killed_goes_on_from_its_state(tmp_path, monkeypatch, how, error, when):
+    in_processes(monkeypatch)
+    path = write_sweep(tmp_path, {"A": ("td3", {})}, steps=90)
+    straight = study_of(path, 8, tmp_path / "straight")
+    ending = Ending(monkeypatch, how, when)
+    sweep, ledger = load_sweep(str(path)), Ledger(InMemoryStorage(), "tiny")
+    ledger.open(sweep, {"experiment": sweep.name})
+    with pytest.raises(error) as raised:
+        execute_runs(ledger, tmp_path / "logs", "a process", device="cpu", population=8)
+    assert getattr(raised.value, "code", 143) == 143
+    assert max(StateStore(next((tmp_path / "logs").glob("tiny/populations/*/state"))).steps()) >= 2 * 30
+    monkeypatch.setattr(ending, "end", lambda now: None)
+    execute_runs(ledger, tmp_path / "logs", "another process", device="cpu", population=8)
+    assert [record.error for record in ledger.records()] == [None, None]
+    finals = [{record.key: record.final for record in each.records()} for each in (straight, ledger)]
+    assert finals[0] == finals[1]
+
+
+def test_an_interrupt_of_all_processes_leaves_the_environments_to_the_main_process():
+    env = ChunkedSubprocVecEnv([PendulumEnv] * 2, n_processes=2, start_method="fork")
+    env.reset()
+    for process in env.processes:
+        os.kill(process.pid, signal.SIGINT)
+    # Answered after the signal
+    assert len(env.step(np.zeros((2, 1), np.float32))[0]) == 2
+    env.step_async(np.zeros((2, 1), np.float32))
+    env.remotes[0].recv()
+    # An interrupted step has read one of two replies
+    close_environments(env)
+    assert env.closed
+    assert not any(process.is_alive() for process in env.processes)
 
 
 class Populations(Study):

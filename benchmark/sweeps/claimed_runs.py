@@ -96,6 +96,14 @@ class ClaimedRuns:
                 del self._open[run.key]
         return not is_lost
 
+    def is_held(self) -> bool:
+        """
+        Return whether no other process has ended an open run, which it may then have given to another one.
+
+        :return: whether all open runs are still this process's own
+        """
+        return all(self._ledger.holds(claim) for claim in self._open.values())
+
     def release(self) -> None:
         """Give back all open runs, to be continued by any process."""
         with self._lock:

@@ -18,6 +18,7 @@ from benchmark.sweeps.processes import start_workers, stop
 from benchmark.sweeps.progress import ProgressTracker, display
 from benchmark.sweeps.runs import overview
 from benchmark.sweeps.studies import Ledger
+from benchmark.sweeps.worker_loop import forget_ended
 
 # Seconds between two reads of the study
 INTERVAL = 2.0
@@ -103,7 +104,9 @@ def execute(sweep: Sweep, storage: BaseStorage, study: str, args: argparse.Names
     finally:
         folder = export_study(study, args.storage, args.results)
     left = ledger.left()
-    if left:
+    if not left:
+        forget_ended(ledger, args.logs)
+    else:
         codes = ", ".join(str(worker.returncode) for worker in workers)
         sys.exit(
             f"{len(left)} runs of {study} are left, but all workers have ended (exit codes {codes}): "

@@ -103,6 +103,16 @@ class Group:
         """
         return cls(folder / FOLDER / hashlib.sha256(_as_json(runs)).hexdigest()[:16], list(runs))
 
+    @classmethod
+    def read(cls, folder: Path) -> "Group":
+        """
+        Read the group of a folder.
+
+        :param folder: the population's folder
+        :return: the group
+        """
+        return cls(folder, [Run(**fields) for fields in json.loads((folder / RUNS).read_bytes())])
+
     def write(self) -> None:
         """Write the runs to the group's folder, for the process that goes on with it."""
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -203,8 +213,7 @@ class Groups:
         name = names.get(trial.user_attrs[KEY])
         if name is None or not (self._folder / FOLDER / name / RUNS).is_file():
             return None
-        folder = self._folder / FOLDER / name
-        group = Group(folder, [Run(**fields) for fields in json.loads((folder / RUNS).read_bytes())])
+        group = Group.read(self._folder / FOLDER / name)
         return group if _run(trial) in group.runs and StateStore(group.states).steps() else None
 
     def _stays_alone(self, trial: FrozenTrial, trials: Sequence[FrozenTrial]) -> bool:

@@ -3,6 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from benchmark.common.records import EVALUATION_SEED, FINAL_EPISODES
 from benchmark.sweeps.agent_experiments import AgentExperiment, NewAgent, ResumedAgent
 from benchmark.sweeps.claimed_runs import ClaimedRuns
+from benchmark.sweeps.environment_processes import classified_deaths, close_environments
 from benchmark.sweeps.groups import Group
 from benchmark.sweeps.population_reporter import PopulationReporter
 from benchmark.sweeps.run import begin, register_all
@@ -45,40 +47,39 @@ def train_group(
     for run, folder in zip(group.runs, folders, strict=True):
         register_all(run)
         begin(run, folder)
-    try:
-        experiments, population = _set_up(group, folders, device)
-    except NoStateLeftError as error:
-        print(f"Population {group.folder.name} starts from the beginning: {error}", flush=True)
-        shutil.rmtree(group.states)
-        experiments, population = _set_up(group, folders, device)
-    assert population.env is not None
-    first = group.runs[0]
-    evaluation = PopulationEvalCallback(
-        _join(group, experiments, device, eval_env=True),
-        n_eval_episodes=first.evaluation_episodes,
-        eval_freq=first.evaluation_interval,
-        verbose=0,
-    )
-    # The reporter is the last one: where no step is left, the callback before it restores the evaluations
-    reporter = PopulationReporter(group.runs, folders, evaluation, claimed, watch)
-    saving = TrainingCheckpointCallback(len(group.runs) * first.checkpoint_interval, group.states, keep=1)
-    try:
-        population.learn(len(group.runs) * first.steps, callback=[evaluation, saving, reporter])
-        # Those of offline training, too
-        reporter.report_failures()
-        return _finish(group, experiments, population, evaluation.eval_env, claimed)
-    except ValueError:
-        # Raised when all agents have failed
-        reporter.report_failures()
-        if len(population.failed) < len(population):
-            raise
-        return {}
-    finally:
-        population.env.close()
-        evaluation.eval_env.close()
+    with ExitStack() as environments, classified_deaths():
+        try:
+            experiments, population = _set_up(group, folders, device, environments)
+        except NoStateLeftError as error:
+            print(f"Population {group.folder.name} starts from the beginning: {error}", flush=True)
+            shutil.rmtree(group.states)
+            experiments, population = _set_up(group, folders, device, environments)
+        first = group.runs[0]
+        evaluation = PopulationEvalCallback(
+            _join(group, experiments, device, environments, eval_env=True),
+            n_eval_episodes=first.evaluation_episodes,
+            eval_freq=first.evaluation_interval,
+            verbose=0,
+        )
+        # The reporter is the last one: where no step is left, the callback before it restores the evaluations
+        reporter = PopulationReporter(group.runs, folders, evaluation, claimed, watch)
+        saving = TrainingCheckpointCallback(len(group.runs) * first.checkpoint_interval, group.states, keep=1)
+        try:
+            population.learn(len(group.runs) * first.steps, callback=[evaluation, saving, reporter])
+            # Those of offline training, too
+            reporter.report_failures()
+            return _finish(group, experiments, population, evaluation.eval_env, claimed)
+        except ValueError:
+            # Raised when all agents have failed
+            reporter.report_failures()
+            if len(population.failed) < len(population):
+                raise
+            return {}
 
 
-def _set_up(group: Group, folders: Sequence[Path], device: str) -> tuple[list[AgentExperiment], Population]:
+def _set_up(
+    group: Group, folders: Sequence[Path], device: str, environments: ExitStack
+) -> tuple[list[AgentExperiment], Population]:
     """Return rl_zoo3's manager of each run, and the population, which starts or continues."""
     runs = group.runs
     continues = bool(StateStore(group.states).steps())
@@ -87,7 +88,7 @@ def _set_up(group: Group, folders: Sequence[Path], device: str) -> tuple[list[Ag
     set_random_seed(runs[0].seed)
     for experiment in experiments:
         experiment.setup_experiment()
-    env = _join(group, experiments, device)
+    env = _join(group, experiments, device, environments)
     if continues:
         population = Population.resume(group.states, env, device=device)
         assert population.resumption is not None
@@ -101,13 +102,20 @@ def _set_up(group: Group, folders: Sequence[Path], device: str) -> tuple[list[Ag
     return experiments, Population("MlpPolicy", env, arguments, device=device)
 
 
-def _join(group: Group, experiments: Sequence[AgentExperiment], device: str, eval_env: bool = False) -> VecEnv:
-    """Return the environments of all runs, each made by rl_zoo3's manager of its run, and seeded as it would seed them."""
+def _join(
+    group: Group, experiments: Sequence[AgentExperiment], device: str, environments: ExitStack, eval_env: bool = False
+) -> VecEnv:
+    """
+    Return the environments of all runs, each made by rl_zoo3's manager of its run, and seeded as it would seed them.
+
+    The stack closes them.
+    """
     makers: list[Callable[[], gym.Env]] = [
         partial(_make_env, run, experiment, eval_env) for run, experiment in zip(group.runs, experiments, strict=True)
     ]
     # On a CPU, the simulators would take the cores of the gradient steps
     env: VecEnv = ChunkedSubprocVecEnv(makers) if get_device(device).type == "cuda" else DummyVecEnv(makers)
+    environments.callback(close_environments, env)
     _seed(env, [run.seed for run in group.runs])
     return env
 

@@ -37,8 +37,13 @@ from sb3_cgp.zoo.resumed_run import ResumedExperiment
 
 # The file in a run's folder with the run that its states belong to
 SETTINGS = "run.json"
-# Errors that are no fault of the run: of the database, the disk, a missing package, or too little memory
-MACHINE_ERRORS = (*STORAGE_ERRORS, OSError, ImportError, DependencyNotInstalled, MemoryError, th.OutOfMemoryError)
+# Errors that are no fault of the run: of the database, the disk, a missing package, too little memory, or a GPU, which no
+# training of the same process can use after such an error
+MACHINE_ERRORS = (
+    *(*STORAGE_ERRORS, OSError, ImportError, DependencyNotInstalled, MemoryError, th.OutOfMemoryError),
+    # PyTorch has it since 2.8
+    getattr(th, "AcceleratorError", th.OutOfMemoryError),
+)
 
 
 def run_folder(logs: Path, study: str, run: Run) -> Path:

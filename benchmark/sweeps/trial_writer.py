@@ -79,6 +79,15 @@ class TrialWriter(StudyView):
         if patiently(self.storage.get_trial, claim.trial_id).state is not TrialState.COMPLETE:
             raise TrialLostError(claim.run.key)
 
+    def holds(self, claim: Claim) -> bool:
+        """
+        Return whether a run is still this process's own.
+
+        :param claim: the run
+        :return: whether no process has ended its trial
+        """
+        return not patiently(self.storage.get_trial, claim.trial_id).state.is_finished()
+
     def fail(self, claim: Claim, error: BaseException) -> None:
         """
         End a run that failed for its own reasons.

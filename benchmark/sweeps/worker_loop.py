@@ -11,13 +11,14 @@ from pathlib import Path
 from filelock import FileLock
 
 from benchmark.sweeps.claimed_runs import ClaimedRuns
-from benchmark.sweeps.groups import Group, Groups
+from benchmark.sweeps.groups import FOLDER, RUNS, Group, Groups
 from benchmark.sweeps.heartbeats import BEAT, HeartbeatThread, TrialLostError
 from benchmark.sweeps.population_run import train_group
 from benchmark.sweeps.processes import PAUSE, TERMINATED
-from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, run_folder, train
+from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, has_state, run_folder, train
+from benchmark.sweeps.runs import Run
 from benchmark.sweeps.studies import Ledger
-from benchmark.sweeps.study_trials import Claim
+from benchmark.sweeps.study_trials import RUN, Claim, owned
 
 
 def execute_runs(
@@ -48,6 +49,7 @@ def execute_runs(
         if claims:
             _train_claimed(ledger, claims, group, logs, beat, parent, device)
         elif not ledger.left():
+            forget_ended(ledger, logs)
             return
         else:
             # Runs of other processes, or of lost ones whose grace period has not passed
@@ -67,34 +69,38 @@ def _train_claimed(
     def report(step: int, value: float) -> None:
         claimed.report(runs[0], step, value)
 
-    try:
-        with HeartbeatThread(claimed.beat, beat, parent) as heartbeat, _locked(folders):
+    # The states are removed before the locks are released, as another process may then continue from them
+    with ExitStack() as locks:
+        try:
+            with HeartbeatThread(claimed.beat, beat, parent) as heartbeat:
+                locks.enter_context(_locked(folders))
+                if group is None:
+                    finals = {0: train(runs[0], folders[0], report, heartbeat.watch, device)}
+                else:
+                    finals = train_group(group, folders, claimed, heartbeat.watch, device)
+            lost = [runs[index].key for index, final in finals.items() if not claimed.complete(runs[index], final)]
+            for key in lost:
+                print(f"{key} was given to another process", flush=True)
+            # Another process continues a lost run from its last state
+            if not lost:
+                _forget(group, folders)
+        except TrialLostError:
+            print(f"{_in_words(claims, group)} was given to another process", flush=True)
+            claimed.release()
+        except MACHINE_ERRORS:
+            claimed.release()
+            raise
+        except Exception as error:
+            traceback.print_exc()
             if group is None:
-                finals = {0: train(runs[0], folders[0], report, heartbeat.watch, device)}
+                claimed.fail(runs[0], error)
             else:
-                finals = train_group(group, folders, claimed, heartbeat.watch, device)
-        lost = [runs[index].key for index, final in finals.items() if not claimed.complete(runs[index], final)]
-        for key in lost:
-            print(f"{key} was given to another process", flush=True)
-        # Another process continues a lost run from its last state
-        if not lost:
-            _forget(group, folders)
-    except TrialLostError:
-        print(f"{_in_words(claims, group)} was given to another process", flush=True)
-        claimed.release()
-    except MACHINE_ERRORS:
-        claimed.release()
-        raise
-    except Exception as error:
-        traceback.print_exc()
-        if group is None:
-            claimed.fail(runs[0], error)
-        else:
-            _forget(group, folders)
-            claimed.dissolve(error)
-    except BaseException:
-        claimed.release()
-        raise
+                if claimed.is_held():
+                    _forget(group, folders)
+                claimed.dissolve(error)
+        except BaseException:
+            claimed.release()
+            raise
 
 
 def _in_words(claims: Sequence[Claim], group: Group | None) -> str:
@@ -111,6 +117,24 @@ def _locked(folders: Sequence[Path]) -> Iterator[None]:
             folder.mkdir(parents=True, exist_ok=True)
             stack.enter_context(FileLock(folder / ".lock"))
         yield
+
+
+def forget_ended(ledger: Ledger, logs: Path) -> None:
+    """
+    Remove the states of ended runs, which are left where a process was killed between the end of a run and their removal.
+
+    :param ledger: a study of which no run is left
+    :param logs: the folder of all sweeps' runs
+    """
+    ended = [Run(**trial.user_attrs[RUN]) for trial in owned(ledger.trials()).values() if trial.state.is_finished()]
+    for path in (logs / ledger.name / FOLDER).glob(f"*/{RUNS}"):
+        group = Group.read(path.parent)
+        if all(run in ended for run in group.runs):
+            _forget(group, [])
+    for run in ended:
+        folder = run_folder(logs, ledger.name, run)
+        if has_state(run, folder):
+            forget_states(folder)
 
 
 def _forget(group: Group | None, folders: Sequence[Path]) -> None:

@@ -2,6 +2,7 @@
 
 import multiprocessing as mp
 import os
+import signal
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -317,6 +318,10 @@ class ChunkedSubprocVecEnv(SubprocVecEnv):
 
 def _step_chunk(remote: Connection, parent_remote: Connection, env_fns: CloudpickleWrapper) -> None:
     """Answer the requests of a :class:`ChunkedSubprocVecEnv` about the environments of one process."""
+    # Ctrl-C in a terminal reaches all processes: the main process still needs the environments to save its state, and ends
+    # this one. A forked process has the main process's handler of SIGTERM.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     parent_remote.close()
     envs = DummyVecEnv(env_fns.var)
     while True:
@@ -341,7 +346,7 @@ def _step_chunk(remote: Connection, parent_remote: Connection, env_fns: Cloudpic
                 envs.close()
                 remote.close()
                 break
-        except (EOFError, KeyboardInterrupt):
+        except EOFError:
             break
 
 
