@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shutil
 import signal
 import time
 from dataclasses import fields
@@ -23,7 +24,7 @@ from benchmark.common.records import EVALUATION_SEED, Record
 from benchmark.reporting.figures import figures
 from benchmark.reporting.run_curves import read_curve
 from benchmark.reporting.zoo_runs import run_in
-from benchmark.sweeps import population_run
+from benchmark.sweeps import population_run, worker_loop
 from benchmark.sweeps.environment_processes import close_environments
 from benchmark.sweeps.execution import describe
 from benchmark.sweeps.experiments import load_sweep
@@ -284,6 +285,34 @@ def test_a_sweep_by_populations_has_the_runs_and_the_page_of_one_without(tmp_pat
     paths = [sorted(run.name for run in (tmp_path / size / "logs").glob("tiny/*/*/*")) for size in ("1", "8")]
     assert paths[0] == paths[1]
     assert not list((tmp_path / "8" / "logs" / "tiny" / "populations").iterdir())
+
+
+@pytest.mark.filterwarnings("ignore:Agent 1 has failed")
+@pytest.mark.parametrize("is_removed", [False, True])
+def test_the_folder_of_a_run_that_has_failed_remains_as_it_is(tmp_path, monkeypatch, is_removed):
+    path = write_sweep(tmp_path, {"A": ("td3", {}), "B": ("td3", dict(learning_rate=1e30))}, seeds=1, steps=430)
+    sweep, ledger = load_sweep(str(path)), Ledger(InMemoryStorage(), "tiny")
+    ledger.open(sweep, {"experiment": sweep.name})
+    report = population_run.PopulationReporter._on_step
+    with monkeypatch.context() as patch:
+        # The first episode has ended
+        stopping = lambda self: report(self) and (self.n_calls < 210 or interrupt_at(0)(0))  # noqa: E731
+        patch.setattr(population_run.PopulationReporter, "_on_step", stopping)
+        patch.setattr(worker_loop, "MACHINE_ERRORS", Interruption)
+        with pytest.raises(Interruption):
+            execute_runs(ledger, tmp_path / "logs", "a process", device="cpu", population=8)
+    good, failed = ((next((tmp_path / "logs").glob(f"tiny/{name}/td3/*"))) for name in "AB")
+    before = (failed / "0.monitor.csv").read_text()
+    assert (len(rows(good)), len(rows(failed))) == (2, 1)
+    if is_removed:
+        shutil.rmtree(failed)
+    execute_runs(ledger, tmp_path / "logs", "another process", device="cpu", population=8)
+    assert len(rows(good)) == 3
+    if not is_removed:
+        assert (failed / "0.monitor.csv").read_text() == before
+    records = {record.method: record for record in ledger.records()}
+    assert records["A"].error is None
+    assert records["A"].population == 2
 
 
 class Ending:

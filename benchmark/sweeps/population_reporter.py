@@ -51,9 +51,12 @@ class PopulationReporter(BaseCallback):
         self._report_new()
 
     def report_failures(self) -> None:
-        """End the runs of the agents that have failed."""
+        """End the runs of the agents that have failed, and the logs of their episodes."""
         for index, reason in self.model.failed.items():
-            self._claimed.fail(self._runs[index], ValueError(reason))
+            if self._claimed.is_open(self._runs[index]):
+                self._claimed.fail(self._runs[index], ValueError(reason))
+                assert self.model.env is not None
+                self.model.env.env_method("set_wrapper_attr", "results_writer", None, indices=index)
 
     def _report_new(self) -> None:
         evaluation = self._evaluation

@@ -1,4 +1,8 @@
-"""The runs of a group, trained as one population: each in its own folder, which is as it would be if it were trained alone."""
+"""
+The runs of a group, trained as one population: each in its own folder, which is as it would be if it were trained alone.
+
+The folder of a run that has ended remains as it is, while the run's agent stays in the population.
+"""
 
 import math
 import shutil
@@ -21,7 +25,7 @@ from benchmark.sweeps.population_reporter import PopulationReporter
 from benchmark.sweeps.run import begin, register_all
 from benchmark.sweeps.runs import Run
 from benchmark.sweeps.sharing import agent_arguments, ordinary_model
-from benchmark.sweeps.zoo_experiments import new_experiment, resumed_experiment
+from benchmark.sweeps.zoo_experiments import has_settings, new_experiment, resumed_experiment
 from sb3_cgp import RestorableEnv, TrainingCheckpointCallback
 from sb3_cgp.population import ChunkedSubprocVecEnv, Population, PopulationEvalCallback, evaluate_population
 from sb3_cgp.resumption.store import NoStateLeftError, StateStore
@@ -49,14 +53,14 @@ def train_group(
         begin(run, folder)
     with ExitStack() as environments, classified_deaths():
         try:
-            experiments, population = _set_up(group, folders, device, environments)
+            experiments, population = _set_up(group, folders, claimed, device, environments)
         except NoStateLeftError as error:
             print(f"Population {group.folder.name} starts from the beginning: {error}", flush=True)
             shutil.rmtree(group.states)
-            experiments, population = _set_up(group, folders, device, environments)
+            experiments, population = _set_up(group, folders, claimed, device, environments)
         first = group.runs[0]
         evaluation = PopulationEvalCallback(
-            _join(group, experiments, device, environments, eval_env=True),
+            _join(group, experiments, device, environments),
             n_eval_episodes=first.evaluation_episodes,
             eval_freq=first.evaluation_interval,
             verbose=0,
@@ -78,21 +82,21 @@ def train_group(
 
 
 def _set_up(
-    group: Group, folders: Sequence[Path], device: str, environments: ExitStack
+    group: Group, folders: Sequence[Path], claimed: ClaimedRuns, device: str, environments: ExitStack
 ) -> tuple[list[AgentExperiment], Population]:
     """Return rl_zoo3's manager of each run, and the population, which starts or continues."""
     runs = group.runs
     continues = bool(StateStore(group.states).steps())
-    kind, make = (ResumedAgent, resumed_experiment) if continues else (NewAgent, new_experiment)
-    experiments: list[AgentExperiment] = [make(kind, run, folder, device) for run, folder in zip(runs, folders, strict=True)]
+    experiments = [_experiment(run, folder, device, continues) for run, folder in zip(runs, folders, strict=True)]
     set_random_seed(runs[0].seed)
     for experiment in experiments:
         experiment.setup_experiment()
-    env = _join(group, experiments, device, environments)
+    are_open = [claimed.is_open(run) for run in runs]
+    env = _join(group, experiments, device, environments, are_open)
     if continues:
         population = Population.resume(group.states, env, device=device)
         assert population.resumption is not None
-        monitors = [folder / f"0.{Monitor.EXT}" for folder in folders]
+        monitors = [folder / f"0.{Monitor.EXT}" if log else None for folder, log in zip(folders, are_open, strict=True)]
         continue_monitors(monitors, env, population.num_timesteps, population.resumption["environment"])
         return experiments, population
     arguments = [
@@ -102,16 +106,24 @@ def _set_up(
     return experiments, Population("MlpPolicy", env, arguments, device=device)
 
 
+def _experiment(run: Run, folder: Path, device: str, continues: bool) -> AgentExperiment:
+    # The states are not in the run's folder, which a user may have removed after the run's end
+    if continues and has_settings(folder):
+        return resumed_experiment(ResumedAgent, run, folder, device)
+    return new_experiment(NewAgent, run, folder, device)
+
+
 def _join(
-    group: Group, experiments: Sequence[AgentExperiment], device: str, environments: ExitStack, eval_env: bool = False
+    group: Group, experiments: Sequence[AgentExperiment], device: str, environments: ExitStack, logged: Sequence[bool] = ()
 ) -> VecEnv:
     """
     Return the environments of all runs, each made by rl_zoo3's manager of its run, and seeded as it would seed them.
 
-    The stack closes them.
+    The stack closes them. Whether the episodes of each run are logged is given for those of the training only.
     """
     makers: list[Callable[[], gym.Env]] = [
-        partial(_make_env, run, experiment, eval_env) for run, experiment in zip(group.runs, experiments, strict=True)
+        partial(_make_env, run, experiment, not logged, not (logged and logged[index]))
+        for index, (run, experiment) in enumerate(zip(group.runs, experiments, strict=True))
     ]
     # On a CPU, the simulators would take the cores of the gradient steps
     env: VecEnv = ChunkedSubprocVecEnv(makers) if get_device(device).type == "cuda" else DummyVecEnv(makers)
@@ -120,10 +132,10 @@ def _join(
     return env
 
 
-def _make_env(run: Run, experiment: AgentExperiment, eval_env: bool) -> gym.Env:
+def _make_env(run: Run, experiment: AgentExperiment, eval_env: bool, no_log: bool) -> gym.Env:
     """Make the environment of a run, also in another process."""
     register_all(run)
-    env = experiment.create_envs(1, eval_env=eval_env)
+    env = experiment.create_envs(1, eval_env, no_log)
     assert isinstance(env, DummyVecEnv)
     return RestorableEnv(env.envs[0])
 

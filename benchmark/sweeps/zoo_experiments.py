@@ -12,8 +12,22 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from benchmark.sweeps.runs import Run
 from sb3_cgp.common.files import write_atomically
+from sb3_cgp.resumption.store import NoStateLeftError
+
+# The file of the hyperparameters, in the folder of the environment's name
+SETTINGS = "*/config.yml"
 
 Experiment = TypeVar("Experiment", bound=ExperimentManager)
+
+
+def has_settings(folder: Path) -> bool:
+    """
+    Return whether a folder holds the hyperparameters that rl_zoo3 saved when a run began.
+
+    :param folder: the run's folder
+    :return: whether the run can continue in the folder
+    """
+    return any(folder.glob(SETTINGS))
 
 
 def resumed_experiment(kind: Callable[..., Experiment], run: Run, folder: Path, device: str) -> Experiment:
@@ -25,9 +39,12 @@ def resumed_experiment(kind: Callable[..., Experiment], run: Run, folder: Path, 
     :param folder: the run's folder
     :param device: device of the networks
     :return: the manager
+    :raises NoStateLeftError: if the folder does not hold the hyperparameters that rl_zoo3 saved when the run began
     """
+    if not has_settings(folder):
+        raise NoStateLeftError(f"{folder} has no {SETTINGS}, which rl_zoo3 saves when a run begins")
     # With the hyperparameters of the algorithm's YAML file
-    (saved,) = folder.glob("*/config.yml")
+    (saved,) = folder.glob(SETTINGS)
     return kind(folder, _arguments(run, folder, device), dict(yaml.load(saved.read_text(), Loader=yaml.UnsafeLoader)))
 
 

@@ -115,11 +115,11 @@ class ResumedExperiment(ExperimentManager):
         print(f"Log path: {self.save_path}")
 
 
-def continue_monitors(paths: Sequence[Path], env: VecEnv, timestep: int, state: Any) -> None:
+def continue_monitors(paths: Sequence[Path | None], env: VecEnv, timestep: int, state: Any) -> None:
     """
     Remove the episodes that ended after the state was saved, because the training repeats them.
 
-    :param paths: the file of each environment's monitor
+    :param paths: the file of each environment's monitor; None for a monitor without a file
     :param env: the environments
     :param timestep: the steps of all environments together when the state was saved
     :param state: the environments' state; None if it was not saved
@@ -130,6 +130,8 @@ def continue_monitors(paths: Sequence[Path], env: VecEnv, timestep: int, state: 
         restore_environment(env, state)
         n_episodes = [len(lengths) for lengths in env.get_attr("episode_lengths")]
     for index, path in enumerate(paths):
+        if path is None:
+            continue
         cut_monitors(path, n_episodes[index], timestep // env.num_envs)
         # The times in the file are relative to the one in its header
         env.env_method("set_wrapper_attr", "t_start", read_start(path), indices=index)
