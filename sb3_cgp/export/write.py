@@ -81,10 +81,10 @@ def export_policy(model: ExportableModel, folder: str | Path) -> None:
     :raises FileExistsError: if the folder is a file
     :raises ImportError: if a package of the ``export`` extra is not installed
     """
-    allowed = "the name of a folder, in which policy.onnx is written, such as 'exported_policy'"
-    require(Path(folder).suffix not in SUFFIXES, "folder", str(folder), allowed)
     if Path(folder).is_file():
         raise FileExistsError(errno.EEXIST, "Is a file, and must be a folder or a new name", str(folder))
+    allowed = "the name of a folder, in which policy.onnx is written, such as 'exported_policy'"
+    require(Path(folder).is_dir() or Path(folder).suffix not in SUFFIXES, "folder", str(folder), allowed)
     # Before anything is computed
     names = ("safetensors.torch", "onnxruntime", "onnx", "onnxscript")
     safetensors_torch, *_ = (import_from_extra(name, "export", PURPOSE) for name in names)
