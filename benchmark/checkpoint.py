@@ -7,8 +7,8 @@ Measure the time that it takes to save and to load a whole training state, with 
 import argparse
 from collections.abc import Sequence
 
-from benchmark.common.arguments import continuous_environment, count
-from benchmark.common.measuring import measure_and_publish, measuring_parser
+from benchmark.common.arguments import count
+from benchmark.common.measuring import add_environment, measure_and_publish, measuring_parser
 from benchmark.speed.checkpoints import markdown, measure
 
 RECORDED = ("env", "seed", "transitions", "new", "rounds")
@@ -27,9 +27,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         example="--transitions 10000 --rounds 2",
         duration="minutes, and memory and disk for a million transitions",
     )
-    parser.add_argument(
-        "--env", type=continuous_environment, default="HalfCheetah-v5", help="the environment (default: %(default)s)"
-    )
+    add_environment(parser)
     parser.add_argument(
         "--transitions", type=count, default=1_000_000, help="size of the replay buffer (default: %(default)s)"
     )

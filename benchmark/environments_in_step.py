@@ -11,9 +11,9 @@ from typing import Any
 
 import torch as th
 
-from benchmark.common.arguments import continuous_environment, count
+from benchmark.common.arguments import count
 from benchmark.common.files import publish
-from benchmark.common.measuring import measuring_parser
+from benchmark.common.measuring import add_environment, measuring_parser
 from benchmark.common.provenance import conditions
 from benchmark.speed.environment_page import markdown
 from benchmark.speed.environment_steps import measure
@@ -36,9 +36,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         example="--numbers 4 --rounds 2 --env Pendulum-v1",
         duration="some minutes",
     )
-    parser.add_argument(
-        "--env", type=continuous_environment, default="HalfCheetah-v5", help="the environment (default: %(default)s)"
-    )
+    add_environment(parser)
     parser.add_argument(
         "--numbers", type=count, nargs="+", default=[8, 32, 128], help="numbers of environments (default: %(default)s)"
     )

@@ -7,8 +7,8 @@ Measure the time from an observation to an action: by ``predict``, the exported 
 import argparse
 from collections.abc import Sequence
 
-from benchmark.common.arguments import continuous_environment, count
-from benchmark.common.measuring import measure_and_publish, measuring_parser
+from benchmark.common.arguments import count
+from benchmark.common.measuring import add_environment, measure_and_publish, measuring_parser
 from benchmark.speed.latencies import markdown, measure
 
 RECORDED = ("env", "seed", "rounds", "actions")
@@ -27,9 +27,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         example="--rounds 10",
         duration="about a minute",
     )
-    parser.add_argument(
-        "--env", type=continuous_environment, default="HalfCheetah-v5", help="the environment (default: %(default)s)"
-    )
+    add_environment(parser)
     parser.add_argument("--rounds", type=count, default=50, help="timed rounds (default: %(default)s)")
     parser.add_argument("--actions", type=count, default=200, help="actions per round (default: %(default)s)")
     return parser.parse_args(argv)

@@ -14,9 +14,9 @@ from typing import Any
 
 import torch as th
 
-from benchmark.common.arguments import continuous_environment, count
+from benchmark.common.arguments import count
 from benchmark.common.files import write_json
-from benchmark.common.measuring import TIME_OVER, measuring_parser
+from benchmark.common.measuring import TIME_OVER, add_environment, measuring_parser
 from benchmark.common.provenance import conditions
 from benchmark.speed.card_estimates import estimate_all
 from benchmark.speed.population_methods import METHODS
@@ -45,9 +45,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("--numbers", type=count, nargs="+", default=NUMBERS, help="numbers of agents (default: %(default)s)")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="methods (default: all)")
-    parser.add_argument(
-        "--env", type=continuous_environment, default="HalfCheetah-v5", help="the environment (default: %(default)s)"
-    )
+    add_environment(parser)
     parser.add_argument(
         "--processes",
         type=count,

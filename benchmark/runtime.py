@@ -7,8 +7,8 @@ Measure the paper's run-time table on this machine: seconds per episode of train
 import argparse
 from collections.abc import Sequence
 
-from benchmark.common.arguments import continuous_environment, count
-from benchmark.common.measuring import measure_and_publish, measuring_parser
+from benchmark.common.arguments import count
+from benchmark.common.measuring import add_environment, measure_and_publish, measuring_parser
 from benchmark.speed.contenders import CONTENDERS
 from benchmark.speed.run_times import measure
 from benchmark.speed.runtime_table import markdown
@@ -34,9 +34,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         "--inference-episodes", type=count, default=30, help="inference episodes per method (default: %(default)s)"
     )
     parser.add_argument("--episode-steps", type=count, default=1000, help="steps per episode (default: %(default)s)")
-    parser.add_argument(
-        "--env", type=continuous_environment, default="HalfCheetah-v5", help="environment (default: %(default)s)"
-    )
+    add_environment(parser, "environment")
     parser.add_argument(
         "--methods", nargs="+", choices=list(CONTENDERS), default=list(CONTENDERS), help="methods to measure (default: all)"
     )

@@ -7,8 +7,8 @@ Measure how the cost of training grows: with CEM's settings, the networks, the s
 import argparse
 from collections.abc import Sequence
 
-from benchmark.common.arguments import continuous_environment, count
-from benchmark.common.measuring import measure_and_publish, measuring_parser
+from benchmark.common.arguments import count
+from benchmark.common.measuring import add_environment, measure_and_publish, measuring_parser
 from benchmark.speed.scaling_figure import draw
 from benchmark.speed.scaling_points import AXES, measure
 from sb3_cgp.common.files import write_atomically
@@ -32,12 +32,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--rounds", type=count, default=10, help="timed runs of each setting (default: %(default)s)")
     # An even number, as TD3 updates its actor in every second one
     parser.add_argument("--gradient-steps", type=count, default=10, help="gradient steps per run (default: %(default)s)")
-    parser.add_argument(
-        "--env",
-        type=continuous_environment,
-        default="HalfCheetah-v5",
-        help="environment to run several of in parallel (default: %(default)s)",
-    )
+    add_environment(parser, "environment to run several of in parallel")
     parser.add_argument("--axes", nargs="+", choices=list(AXES), default=list(AXES), help="axes to vary (default: all)")
     return parser.parse_args(argv)
 

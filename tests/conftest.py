@@ -87,3 +87,14 @@ def dict_export(tmp_path_factory):
 def folder(exports, tmp_path):
     """A copy of an export, to be spoilt."""
     return Path(shutil.copytree(exports[0][0], tmp_path / "export"))
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that a test moves, and stand-ins for what takes time in a sweep."""
+    # Here, as Optuna takes a second to import
+    from studies import Clock, pretend
+
+    clock = Clock()
+    pretend(monkeypatch, clock)
+    return clock

@@ -14,7 +14,7 @@ from gymnasium.error import DependencyNotInstalled
 from optuna.exceptions import StorageInternalError
 from optuna.storages import InMemoryStorage, RDBStorage
 from optuna.trial import TrialState
-from studies import GRACE, Clock, Crew, assert_each_run_once, make_sweep, mortal, pretend, pretend_to_train, work_through
+from studies import GRACE, Clock, Crew, assert_each_run_once, make_sweep, mortal, pretend_to_train, work_through
 
 import benchmark.worker
 from benchmark.sweeps import worker_loop as worker
@@ -24,13 +24,6 @@ from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME, WORKER, distributions_of, with_seed
 from benchmark.sweeps.validation import SweepError
 from benchmark.sweeps.worker_loop import execute_runs
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    clock = Clock()
-    pretend(monkeypatch, clock)
-    return clock
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ from studies import (
     assert_each_run_once,
     make_sweep,
     mortal,
-    pretend,
     pretend_to_train,
     pretend_to_train_group,
     work_through,
@@ -32,13 +31,6 @@ from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME, POPULATION
 from benchmark.worker import parse as parse_worker
 from sb3_cgp.resumption.store import StateStore
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    clock = Clock()
-    pretend(monkeypatch, clock)
-    return clock
 
 
 @pytest.fixture

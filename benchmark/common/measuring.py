@@ -7,7 +7,7 @@ from typing import Any
 
 import torch as th
 
-from benchmark.common.arguments import add_epilog, count, device, output_folder
+from benchmark.common.arguments import add_epilog, continuous_environment, count, device, output_folder
 from benchmark.common.files import publish
 from benchmark.common.provenance import conditions
 
@@ -46,6 +46,17 @@ def measuring_parser(
         f"The table or picture and its data are written to --folder. This repository's own are in benchmark/results/{name}.",
     )
     return parser
+
+
+def add_environment(parser: argparse.ArgumentParser, text: str = "the environment") -> None:
+    """
+    Add the argument on the environment.
+
+    :param parser: the command's parser
+    :param text: what the environment is for
+    """
+    text = f"{text} (default: %(default)s)"
+    parser.add_argument("--env", type=continuous_environment, default="HalfCheetah-v5", help=text)
 
 
 def measure_and_publish(

@@ -4,7 +4,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from optuna.exceptions import UpdateFinishedTrialError
@@ -26,6 +27,20 @@ class TrialLostError(RuntimeError):
     """Another process has ended this process's trial."""
 
 
+@contextmanager
+def noticing_loss(name: str) -> Iterator[None]:
+    """
+    Report within a ``with`` block that another process has ended the trial to which the block writes.
+
+    :param name: the trial, or its run, in the error's message
+    :raises TrialLostError: if another process has ended the trial
+    """
+    try:
+        yield
+    except UpdateFinishedTrialError as error:
+        raise TrialLostError(name) from error
+
+
 def send_beat(
     storage: BaseStorage, trial_id: int, count: str, step: int, seconds: float, processor_seconds: float = 0.0
 ) -> None:
@@ -41,10 +56,8 @@ def send_beat(
     :raises TrialLostError: if another process has ended the trial
     """
     progress = {"beat": count, "step": step, "seconds": round(seconds, 1), "processor_seconds": round(processor_seconds, 1)}
-    try:
+    with noticing_loss(f"trial {trial_id}"):
         patiently(storage.set_trial_user_attr, trial_id, PROGRESS, progress)
-    except UpdateFinishedTrialError as error:
-        raise TrialLostError(f"trial {trial_id}") from error
 
 
 class HeartbeatThread:

@@ -2,17 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
 
 from benchmark.sweeps.claimed_runs import ClaimedRuns
+from benchmark.sweeps.reporter import EvaluationReporter
 from benchmark.sweeps.runs import Run
 from sb3_cgp.population import Population, PopulationEvalCallback
 
 
-class PopulationReporter(BaseCallback):
+class PopulationReporter(EvaluationReporter):
     """
     Passes evaluations, steps and failures on, and ends the training when no run is open any more.
 
@@ -38,17 +37,12 @@ class PopulationReporter(BaseCallback):
         super().__init__()
         self._runs, self._folders = runs, folders
         self._evaluation, self._claimed, self._watch = evaluation, claimed, watch
-        self._n_reported = 0
 
     def _on_step(self) -> bool:
         self._watch(self.num_timesteps // len(self._runs))
         self._report_new()
         self.report_failures()
         return self._claimed.has_open
-
-    def _on_training_end(self) -> None:
-        # A population that continues from its last step takes no other
-        self._report_new()
 
     def report_failures(self) -> None:
         """End the runs of the agents that have failed, and the logs of their episodes."""
@@ -71,18 +65,3 @@ class PopulationReporter(BaseCallback):
                 own = {"timesteps": timesteps, "results": results[:, index], "ep_lengths": lengths[:, index]}
                 np.savez(folder / "evaluations", **own)  # type: ignore[arg-type]
         self._n_reported = len(timesteps)
-
-    def get_training_state(self) -> dict[str, Any]:
-        """
-        Return an empty state: a population that continues reports all of its evaluations again.
-
-        :return: an empty dictionary
-        """
-        return {}
-
-    def set_training_state(self, state: dict[str, Any]) -> None:
-        """
-        Ignore the empty state.
-
-        :param state: an empty dictionary
-        """

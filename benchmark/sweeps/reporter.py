@@ -10,7 +10,38 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 Report = Callable[[int, float], None]
 
 
-class Reporter(BaseCallback):
+class EvaluationReporter(BaseCallback):
+    """Reports evaluations once each, by the method that subclasses define, and all of them again after a resumption."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._n_reported = 0
+
+    def _report_new(self) -> None:
+        """Report the evaluations since the last call."""
+        raise NotImplementedError
+
+    def _on_training_end(self) -> None:
+        # A training that continues from its last step takes no other
+        self._report_new()
+
+    def get_training_state(self) -> dict[str, Any]:
+        """
+        Return an empty state: a training that continues reports all of its evaluations again.
+
+        :return: an empty dictionary
+        """
+        return {}
+
+    def set_training_state(self, state: dict[str, Any]) -> None:
+        """
+        Ignore the empty state.
+
+        :param state: an empty dictionary
+        """
+
+
+class Reporter(EvaluationReporter):
     """
     Passes evaluations and steps on.
 
@@ -24,37 +55,17 @@ class Reporter(BaseCallback):
         self._evaluation = evaluation
         self._report = report
         self._watch = watch
-        self._n_reported = 0
 
     def _on_step(self) -> bool:
         self._watch(self.num_timesteps)
         self._report_new()
         return True
 
-    def _on_training_end(self) -> None:
-        # A run that continues from its last step takes no other
-        self._report_new()
-
     def _report_new(self) -> None:
         timesteps, results = self._evaluation.evaluations_timesteps, self._evaluation.evaluations_results
         for step, returns in _new_points(timesteps, results, self._n_reported):
             self._report(step, float(np.mean(returns)))
         self._n_reported = len(timesteps)
-
-    def get_training_state(self) -> dict[str, Any]:
-        """
-        Return an empty state: a run that continues reports all of its evaluations again.
-
-        :return: an empty dictionary
-        """
-        return {}
-
-    def set_training_state(self, state: dict[str, Any]) -> None:
-        """
-        Ignore the empty state.
-
-        :param state: an empty dictionary
-        """
 
 
 def _new_points(

@@ -5,7 +5,7 @@ from typing import Any
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
 
-from benchmark.sweeps.heartbeats import TrialLostError, send_beat
+from benchmark.sweeps.heartbeats import TrialLostError, noticing_loss, send_beat
 from benchmark.sweeps.storages import patiently
 from benchmark.sweeps.study_trials import ERROR, OUTCOME, Claim
 from benchmark.sweeps.study_view import StudyView
@@ -47,10 +47,8 @@ class TrialWriter(StudyView):
         :param value: its value, as JSON has it
         :raises TrialLostError: if another process has ended the trial
         """
-        try:
+        with noticing_loss(claim.run.key):
             patiently(self.storage.set_trial_user_attr, claim.trial_id, name, value)
-        except UpdateFinishedTrialError as error:
-            raise TrialLostError(claim.run.key) from error
 
     def report(self, claim: Claim, step: int, value: float) -> None:
         """
@@ -61,10 +59,8 @@ class TrialWriter(StudyView):
         :param value: mean return
         :raises TrialLostError: if another process has ended the trial
         """
-        try:
+        with noticing_loss(claim.run.key):
             patiently(self.storage.set_trial_intermediate_value, claim.trial_id, step, value)
-        except UpdateFinishedTrialError as error:
-            raise TrialLostError(claim.run.key) from error
 
     def complete(self, claim: Claim, value: float) -> None:
         """
