@@ -128,10 +128,16 @@ def test_sigterm_ends_the_training_with_its_state_whenever_it_comes(at, tmp_path
     assert parameters_equal(CGP.resume(tmp_path, make_vec_env("Pendulum-v1")).learn(50), expected)
 
 
-def test_sigterm_ends_the_offline_training_of_a_policy(tmp_path, monkeypatch):
+@pytest.mark.usefixtures("heeds_interruptions")
+@pytest.mark.parametrize(
+    ("number", "error", "message"),
+    [(signal.SIGTERM, SystemExit, "143"), (signal.SIGINT, KeyboardInterrupt, "its state of step 40")],
+)
+def test_a_signal_ends_the_offline_training_of_a_policy(number, error, message, tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
-    with pytest.raises(SystemExit, match="143"):
-        make_model(policy_training="offline").learn(40, [TrainingCheckpointCallback(10, tmp_path), Do(55, terminate)])
+    stop = Do(55, lambda: os.kill(os.getpid(), number))
+    with pytest.raises(error, match=message):
+        make_model(policy_training="offline").learn(40, [TrainingCheckpointCallback(10, tmp_path), stop])
     resumed = CGP.resume(tmp_path, make_vec_env("Pendulum-v1"))
     assert not resumed._policy_is_trained
     assert resumed.num_timesteps == 40
@@ -167,7 +173,9 @@ def parameters_equal(one, other):
     return all(ours.equal(theirs) for ours, theirs in pairs)
 
 
-def test_processes_forked_during_the_training_end_by_sigterm(tmp_path):
+@pytest.mark.usefixtures("heeds_interruptions")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_processes_forked_during_the_training_end_by_a_signal(number, tmp_path):
     ended = []
     context = multiprocessing.get_context("fork")
     is_running = context.Event()
@@ -181,13 +189,14 @@ def test_processes_forked_during_the_training_end_by_sigterm(tmp_path):
         process.start()
         # Python forgets a signal that comes while it forks
         assert is_running.wait(30)
-        process.terminate()
+        os.kill(process.pid, number)
         process.join(30)
         ended.append(process.exitcode)
         process.kill()
 
     make_model().learn(30, [TrainingCheckpointCallback(10, tmp_path), Do(20, fork)])
-    assert ended == [-signal.SIGTERM]
+    # multiprocessing reports the KeyboardInterrupt, and exits with 1
+    assert ended == [-signal.SIGTERM if number == signal.SIGTERM else 1]
 
 
 def test_a_second_sigterm_acts_as_before(tmp_path, handler):
@@ -199,6 +208,25 @@ def test_a_second_sigterm_acts_as_before(tmp_path, handler):
         assert seen == ["before"]
     finally:
         signal.signal(signal.SIGTERM, handler)
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+def test_a_second_ctrl_c_stops_at_once(tmp_path):
+    press, seen = (lambda: signal.raise_signal(signal.SIGINT)), []
+    callbacks = [TrainingCheckpointCallback(10, tmp_path), Do(33, press), Do(33, press), Do(33, lambda: seen.append(33))]
+    with pytest.raises(KeyboardInterrupt, match=r"^$"):
+        make_model().learn(50, callbacks)
+    assert (seen, StateStore(tmp_path).load()[0]) == ([], 30)
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+@pytest.mark.parametrize("is_ignored", [True, False])
+def test_ctrl_c_that_is_ignored_or_handled_by_others_stays_so(is_ignored, tmp_path):
+    seen = []
+    signal.signal(signal.SIGINT, signal.SIG_IGN if is_ignored else lambda *_: seen.append("theirs"))
+    press = Do(33, lambda: signal.raise_signal(signal.SIGINT))
+    assert make_model().learn(50, [TrainingCheckpointCallback(10, tmp_path), press]).num_timesteps == 50
+    assert seen == ([] if is_ignored else ["theirs"])
 
 
 def test_in_another_thread_states_are_saved_and_signals_left_alone(tmp_path):

@@ -21,6 +21,7 @@ from trainings import Do
 
 from sb3_cgp import CGP
 from sb3_cgp.guards.transitions import BoundsWatch
+from sb3_cgp.resumption import RestorableEnv
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
 from sb3_cgp.resumption.store import StateStore
 
@@ -331,6 +332,33 @@ def test_sigterm_saves_the_state_and_ends_the_process(tmp_path):
     assert caught.value.code == 143
     assert signal.getsignal(signal.SIGTERM) is handler
     assert_resumes(tmp_path / "stopped", 73, learn(tmp_path / "straight"))
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+def test_ctrl_c_saves_the_state_and_is_raised_by_learn(tmp_path, capfd):
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt, match=r"its state of step 73 is in .*stopped; `resume` continues it"):
+        learn(tmp_path / "stopped", function=lambda: signal.raise_signal(signal.SIGINT))
+    assert "stops after this step, and saves its state. Press Ctrl-C again to stop at once" in capfd.readouterr().err
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert_resumes(tmp_path / "stopped", 73, learn(tmp_path / "straight"))
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+@pytest.mark.parametrize("wrapper", [RestorableEnv, Monitor])
+def test_ctrl_c_that_ends_workers_too_keeps_the_last_state(wrapper, tmp_path):
+    env = SubprocVecEnv([lambda: wrapper(Failing())] * 2, start_method="fork")
+
+    def interrupt():
+        for process in env.processes:
+            os.kill(process.pid, signal.SIGINT)
+            process.join(30)
+        signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt, match="its state of step 20 is in"):
+        CGP("MlpPolicy", env, **SMALL).learn(300, [TrainingCheckpointCallback(20, tmp_path), Do(15, interrupt)])
+    assert StateStore(tmp_path).load()[0] == 20
+    assert_buried(env)
 
 
 def test_every_fault_in_the_documentation_has_its_test():

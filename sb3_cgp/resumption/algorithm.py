@@ -211,16 +211,24 @@ class ResumableAlgorithm(ResumableModel):
         self._n_nested_trainings += 1
         try:
             yield
+        except Exception:
+            for each in self._checkpoints():
+                each.stop_if_interrupted()
+            raise
         finally:
             self._n_nested_trainings -= 1
-            for each in () if self.callback is None else iter_callbacks(self.callback):
-                if isinstance(each, TrainingCheckpointCallback):
-                    each.release()
+            for each in self._checkpoints():
+                each.release()
             if self._n_nested_trainings == 0:
                 # Callbacks hold environments and files, many of which can be neither copied nor pickled
                 self.callback = None
                 self._warned_of = frozenset()
                 self.release_folders()
+
+    def _checkpoints(self) -> list[TrainingCheckpointCallback]:
+        """Return the callbacks of the training in progress that save states."""
+        callbacks = () if self.callback is None else iter_callbacks(self.callback)
+        return [each for each in callbacks if isinstance(each, TrainingCheckpointCallback)]
 
 
 def resumable(algorithm: type[OffPolicyAlgorithm]) -> type[ResumableAlgorithm]:

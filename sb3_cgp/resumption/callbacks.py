@@ -1,18 +1,16 @@
 """A callback that saves the complete training state, so that an interrupted training can be resumed."""
 
-import os
 import signal
-import threading
 import warnings
 from pathlib import Path
-from types import FrameType
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cgp.common.rules import require, require_count
 from sb3_cgp.resumption.model import ResumableModel
 from sb3_cgp.resumption.replay_buffers import check_replay_buffer
+from sb3_cgp.resumption.signals import StopSignals
 from sb3_cgp.resumption.state import gather, restore, warn_of_unsaved
 from sb3_cgp.resumption.store import StateStore
 
@@ -25,10 +23,10 @@ class TrainingCheckpointCallback(BaseCallback):
     saved when the next rollout starts. A state is also saved at the end of a training without rollouts, such as CGP's
     offline training of a policy.
 
-    On SIGTERM, which a cluster's scheduler sends, the state is saved when the next rollout would start, and the process exits
-    with status 143. A training without rollouts exits at its next step without saving, as the state at its start was saved.
-    A second SIGTERM has the effect that it has without this callback. Of several such callbacks, the first one handles the
-    signal.
+    On SIGTERM, which a cluster's scheduler sends, and on Ctrl-C, the state is saved when the next rollout would start. Then
+    the process exits with status 143, or ``learn`` raises ``KeyboardInterrupt``. A training without rollouts ends at its next
+    step without saving, as the state at its start was saved. A second signal has the effect that it has without this callback.
+    Of several such callbacks, the first one handles the signals.
 
     One training at a time can use the folder. It is locked from ``resume``, or the start of ``learn``, until ``learn`` ends.
 
@@ -58,9 +56,7 @@ class TrainingCheckpointCallback(BaseCallback):
         self._has_trained_without_rollouts = False
         # `learn` may end in the middle of a step, and a training without rollouts may follow
         self._is_within_step = False
-        self._previous_handler: Any = None
-        self._watching_process = 0
-        self._is_asked_to_stop = False
+        self.signals = StopSignals()
 
     @property
     def path(self) -> str | Path | None:
@@ -95,7 +91,7 @@ class TrainingCheckpointCallback(BaseCallback):
         is_another = not self._store.digests() <= known
         allowed = "a folder without the states of another training: continue that one by `resume`, or choose another folder"
         require(not is_another, "path", str(self.path), allowed)
-        self._watch_for_termination()
+        self.signals.watch()
 
     def _on_rollout_start(self) -> None:
         self._is_in_rollouts = True
@@ -103,7 +99,7 @@ class TrainingCheckpointCallback(BaseCallback):
         self._restore_if_resumed()
         if self.path is None:
             return
-        if self._is_asked_to_stop:
+        if self.signals.noted is not None:
             if self.num_timesteps > self._saved_at or not self.has_state:
                 self._save()
             self._stop()
@@ -116,7 +112,7 @@ class TrainingCheckpointCallback(BaseCallback):
             self._is_within_step = True
         else:
             self._has_trained_without_rollouts = True
-            if self._is_asked_to_stop:
+            if self.signals.noted is not None:
                 self._stop()
         return True
 
@@ -131,9 +127,9 @@ class TrainingCheckpointCallback(BaseCallback):
         self._rollout_is_over = self._has_trained_without_rollouts = False
         if self.path is not None and is_whole:
             self._save()
-        self._restore_handler()
-        # SIGTERM came during the last step or the saving of its state. The code after `learn` could take too long.
-        if self._is_asked_to_stop:
+        self.signals.restore()
+        # The signal came during the last step or the saving of its state. The code after `learn` could take too long.
+        if self.signals.noted is not None:
             self._stop()
 
     def get_training_state(self) -> dict[str, int]:
@@ -160,43 +156,34 @@ class TrainingCheckpointCallback(BaseCallback):
             self._saved_at = self.num_timesteps = self.model.num_timesteps
 
     def _save(self) -> None:
-        self._saved_at = self.num_timesteps
         settings = {"save_freq": self.save_freq, "keep": self.keep, "verbose": self.verbose}
         assert self.model.callback is not None
         warn_of_unsaved(self.model, self.model.callback)
         state = gather(self.model, self.model.callback)
         self._store.save(self.num_timesteps, state | {"checkpoint": settings})
+        self._saved_at = self.num_timesteps
         self.model.saved_to = {**self.model.saved_to, self._folder: self._store.digests()}
         if self.verbose >= 2:
             print(f"Saving the training state of step {self.num_timesteps} to {self.path}")
 
-    def _watch_for_termination(self) -> None:
-        self._is_asked_to_stop = False
-        handler = signal.getsignal(signal.SIGTERM)
-        is_watched = isinstance(getattr(handler, "__self__", None), TrainingCheckpointCallback)
-        # Python sets handlers in the main thread only, and could not restore a handler that is not its own (None)
-        if threading.current_thread() is threading.main_thread() and handler is not None and not is_watched:
-            self._watching_process = os.getpid()
-            self._previous_handler = signal.signal(signal.SIGTERM, self._note_termination)
+    def stop_if_interrupted(self) -> None:
+        """
+        Take an error for a consequence of Ctrl-C, if that was pressed: a terminal sends it to environments' processes, too.
 
-    def _note_termination(self, number: int, frame: FrameType | None) -> None:
-        self._restore_handler()
-        if os.getpid() == self._watching_process:
-            self._is_asked_to_stop = True
-        else:
-            # This process was forked during the training, by a simulator for example: the signal has its usual effect
-            os.kill(os.getpid(), number)
+        :raises KeyboardInterrupt: if Ctrl-C was pressed
+        """
+        if self.signals.noted == signal.SIGINT:
+            self._stop()
 
     def _stop(self) -> NoReturn:
-        self._is_asked_to_stop = False
-        raise SystemExit(128 + signal.SIGTERM)
+        kept = (
+            f"its state of step {self._saved_at} is in {self.path}; `resume` continues it"
+            if self.has_state
+            else "it has no state"
+        )
+        self.signals.end(f"The training was interrupted: {kept}")
 
     def release(self) -> None:
-        """Restore the handler of SIGTERM. Save no state until the next training starts, as this one may have failed."""
+        """Restore the signals' handlers. Save no state until the next training starts, as this one may have failed."""
         self._rollout_is_over = self._has_trained_without_rollouts = False
-        self._restore_handler()
-
-    def _restore_handler(self) -> None:
-        if self._previous_handler is not None:
-            signal.signal(signal.SIGTERM, self._previous_handler)
-            self._previous_handler = None
+        self.signals.restore()

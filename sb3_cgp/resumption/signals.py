@@ -1,0 +1,71 @@
+"""The signals that end a training after its state has been saved: SIGTERM, and Ctrl-C's SIGINT."""
+
+import os
+import signal
+import threading
+from types import FrameType
+from typing import Any, NoReturn
+
+MESSAGE = b"\nThe training stops after this step, and saves its state. Press Ctrl-C again to stop at once, without saving.\n"
+
+
+class StopSignals:
+    """
+    Note a signal that asks the process to end, so that a training can save its state before.
+
+    A second signal has the effect that it has without this object.
+    """
+
+    def __init__(self) -> None:
+        self.noted: int | None = None
+        self._previous: dict[int, Any] = {}
+        self._process = 0
+
+    def watch(self) -> None:
+        """
+        Handle the signals, until :meth:`restore`.
+
+        It has no effect in another thread than the main one, where Python sets no handlers, on a signal that another such
+        object handles, and on SIGINT if it is ignored or has another handler than Python's own.
+        """
+        self.noted = None
+        if threading.current_thread() is not threading.main_thread():
+            return
+        self._process = os.getpid()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            handler = signal.getsignal(number)
+            is_watched = isinstance(getattr(handler, "__self__", None), StopSignals)
+            is_python_s = number == signal.SIGTERM or handler is signal.default_int_handler
+            # A handler that Python has not set (None) could not be restored
+            if handler is not None and not is_watched and is_python_s:
+                self._previous[number] = signal.signal(number, self._note)
+
+    def restore(self) -> None:
+        """Restore the handlers that the signals had."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+        self._previous = {}
+
+    def end(self, reason: str) -> NoReturn:
+        """
+        End the training as the noted signal asks.
+
+        :param reason: the message of the ``KeyboardInterrupt``
+        :raises KeyboardInterrupt: after SIGINT
+        :raises SystemExit: after SIGTERM, with the status 143
+        """
+        number, self.noted = self.noted, None
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt(reason)
+        raise SystemExit(128 + signal.SIGTERM)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.restore()
+        if os.getpid() != self._process:
+            # This process was forked during the training, by a simulator for example: the signal has its usual effect
+            os.kill(os.getpid(), number)
+            return
+        self.noted = number
+        if number == signal.SIGINT:
+            # `print` in a handler may interrupt another `print`
+            os.write(2, MESSAGE)
