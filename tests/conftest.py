@@ -98,3 +98,12 @@ def clock(monkeypatch):
     clock = Clock()
     pretend(monkeypatch, clock)
     return clock
+
+
+@pytest.fixture
+def float64(monkeypatch):
+    """Networks in double precision, so that rounding does not decide between two samples of CEM."""
+    monkeypatch.setattr("stable_baselines3.common.policies.preprocess_obs", lambda obs, *args, **kwargs: obs.double())
+    th.set_default_dtype(th.float64)
+    yield
+    th.set_default_dtype(th.float32)

@@ -103,7 +103,7 @@ def test_a_rehearsal_leaves_the_list_to_do(tmp_path, monkeypatch):
     for options in (["--rehearse"], []):
         args = arguments(tmp_path, *options)
         do_steps(list_steps(args), args, fake)
-    assert fake.names[:3] == ["test_population", "population", "e6"]
+    assert fake.names[:3] == ["test_population_cuda_graphs", "population", "e6"]
     assert fake.names[8:] == [step.name for step in list_steps(arguments(tmp_path))]
 
 

@@ -16,7 +16,6 @@ import yaml
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from optuna.storages import InMemoryStorage
 from rl_zoo3 import ALGOS
-from test_population import float64  # noqa: F401  # a fixture
 from test_sweep_kills import Study
 from test_sweep_run import Interruption, interrupt_at, policy_of, trained
 
