@@ -26,7 +26,7 @@ from benchmark.common.measuring import TIME_OVER
 from sb3_cgp.common.files import write_atomically
 
 ROOT = Path(__file__).parents[1]
-TESTS = ("cuda_graphs", "device_replay", "population_cuda_graphs", "resume", "parity", "learning")
+TESTS = ("cuda_graphs_gpu", "device_replay", "population_cuda_graphs", "resume", "parity", "learning")
 # Sweeps on HalfCheetah-v5 in the order of their value, and e1 on its other tasks
 SWEEPS = ("e6", "e4", "e7", "e8", "e3", "e1")
 OTHER_TASKS = ("Humanoid-v5", "Hopper-v5", "Pusher-v5", "Ant-v5")

@@ -107,3 +107,16 @@ def float64(monkeypatch):
     th.set_default_dtype(th.float64)
     yield
     th.set_default_dtype(th.float32)
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    """Capture on the CPU, by the stand-in."""
+    from graph_models import StandIn
+
+    from sb3_cgp.fast import cuda_graph_algorithm, cuda_graphs
+
+    monkeypatch.setattr(cuda_graph_algorithm, "has_cuda_graphs", lambda device: True)
+    monkeypatch.setattr(cuda_graphs, "Recording", StandIn)
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
+    monkeypatch.setattr(StandIn, "made", 0)

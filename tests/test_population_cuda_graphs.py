@@ -4,8 +4,8 @@ import warnings
 
 import pytest
 import torch as th
+from graph_models import StandIn
 from populations import AGENTS, VARIANTS, make
-from test_cuda_graphs import StandIn
 
 from sb3_cgp.fast import cuda_graphs
 from sb3_cgp.population import training
