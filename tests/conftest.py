@@ -1,5 +1,6 @@
 """What tests share: one thread; the CPU, so that the same is tested with and without a GPU; fixtures of several modules."""
 
+import os
 import shutil
 import signal
 from pathlib import Path
@@ -120,3 +121,41 @@ def stand_in(monkeypatch):
     monkeypatch.setattr(cuda_graphs, "Recording", StandIn)
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
     monkeypatch.setattr(StandIn, "made", 0)
+
+
+@pytest.fixture
+def work(tmp_path, monkeypatch):
+    """Tune in this process, which stands for one that its parent has started."""
+    # Here, as Optuna takes a second to import
+    from optuna.storages import InMemoryStorage
+    from tunings import arguments, tuner_of
+
+    from benchmark import tune
+    from benchmark.sweeps import tune_execution
+
+    monkeypatch.setattr("benchmark.sweeps.run.FINAL_EPISODES", 1)
+
+    def act(*argv, storage=None, grace=60.0, **options):
+        storage = storage or InMemoryStorage()
+        args = tune.parse(arguments(*argv, "--logs", str(tmp_path), "--parent", str(os.getppid()), **options))
+        own = tuner_of(args, storage, grace)
+        tune_execution.execute_trials(own, args)
+        return own.trials()
+
+    return act
+
+
+@pytest.fixture
+def pretend(monkeypatch):
+    """Let runs give what a function of the run says, and note them."""
+    runs = []
+
+    def act(score):
+        def train(run, folder, report, watch, device):
+            runs.append((run.method, run.seed))
+            return score(run)
+
+        monkeypatch.setattr("benchmark.sweeps.tuner.train", train)
+        return runs
+
+    return act
