@@ -159,3 +159,10 @@ def pretend(monkeypatch):
         return runs
 
     return act
+
+
+@pytest.fixture
+def short_final_evaluation(monkeypatch):
+    """Evaluate a finished run in two episodes: this is most of a tiny run's time otherwise."""
+    for module in ("run", "population_run"):
+        monkeypatch.setattr(f"benchmark.sweeps.{module}.FINAL_EPISODES", 2)
