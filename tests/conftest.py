@@ -166,3 +166,14 @@ def short_final_evaluation(monkeypatch):
     """Evaluate a finished run in two episodes: this is most of a tiny run's time otherwise."""
     for module in ("run", "population_run"):
         monkeypatch.setattr(f"benchmark.sweeps.{module}.FINAL_EPISODES", 2)
+
+
+@pytest.fixture
+def ledger():
+    """A ledger of three runs: seeds 0 to 2."""
+    # Here, as Optuna takes a second to import
+    from ledgers import open_ledger
+    from optuna.storages import InMemoryStorage
+    from studies import Clock
+
+    return open_ledger(InMemoryStorage(), Clock())
