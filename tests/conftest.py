@@ -177,3 +177,27 @@ def ledger():
     from studies import Clock
 
     return open_ledger(InMemoryStorage(), Clock())
+
+
+@pytest.fixture(scope="session")
+def drawn_studies(tmp_path_factory):
+    """Studies: of tasks, of an axis, of two axes, and of other methods than the rest; not to be written to."""
+    # Here, as Matplotlib takes a second to import
+    from finished_studies import BASELINES, GRID, runs, score, write_study
+
+    from benchmark.reporting.figures import figures, study_folders
+
+    folder = tmp_path_factory.mktemp("sweeps")
+    write_study(folder / "tasks", runs(score, [*BASELINES, "My-PPO"], tasks=("Pendulum-v1", "ALE/Pong-v5")))
+    write_study(folder / "axis", runs(score, BASELINES, [{"learning_rate": 0.01}, {"learning_rate": 0.001}]), planned=30)
+    write_study(folder / "axes", runs(score, BASELINES, GRID))
+    write_study(folder / "variants", runs(score, ["CGP-Online", "CGP-Offline"], GRID[:2]))
+    figures(study_folders(folder), folder, repetitions=100)
+    return folder
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Write empty files in place of pictures, for tests of what the page says."""
+    for name in ("curves_by_steps", "curves_by_minutes", "final_rewards", "stability", "sensitivity", "values"):
+        monkeypatch.setattr(f"benchmark.reporting.figures.{name}", lambda *args: b"")
