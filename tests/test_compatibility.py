@@ -11,7 +11,7 @@ from benchmark import environments
 from benchmark.compatibility import checking
 from benchmark.compatibility import page as page_module
 from benchmark.compatibility.installing import install, read_pins
-from benchmark.compatibility.packages import Environment, Package
+from benchmark.compatibility.package_types import Environment, Package
 
 # Notes each call; `-m venv` puts a copy of the stand-in where the environment's interpreter would be
 STAND_IN = """#!/bin/sh

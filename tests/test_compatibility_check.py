@@ -10,7 +10,7 @@ import pytest
 
 from benchmark.compatibility import check, checking
 from benchmark.compatibility.checking import summary
-from benchmark.compatibility.packages import Environment, Learning
+from benchmark.compatibility.package_types import Environment, Learning
 
 COUNTS = """
 import gymnasium as gym

@@ -9,7 +9,8 @@ from compatibility_records import WRITTEN, rows_of
 
 from benchmark import environments
 from benchmark.compatibility import check
-from benchmark.compatibility.packages import PACKAGES, Environment, Learning, Package
+from benchmark.compatibility.package_types import Environment, Learning, Package
+from benchmark.compatibility.packages import PACKAGES
 from benchmark.compatibility.page import page
 
 
