@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 from environment_states import PENDULUM, assert_same, make_task, start
-from stable_baselines3.common.vec_env import (
-    VecFrameStack,
-    VecNormalize,
-)
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_cgp.resumption.environments import RestorableEnv, environment_state, restore_environment
 

@@ -11,13 +11,7 @@ import pytest
 from environment_states import PENDULUM, check
 from environments import Doubles
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import (
-    DummyVecEnv,
-    VecExtractDictObs,
-    VecFrameStack,
-    VecNormalize,
-    VecTransposeImage,
-)
+from stable_baselines3.common.vec_env import DummyVecEnv, VecExtractDictObs, VecFrameStack, VecNormalize, VecTransposeImage
 
 from sb3_cgp.resumption.environments import environment_state, restore_environment, why_not_restorable
 

@@ -10,13 +10,7 @@ from gymnasium import wrappers
 from rl_zoo3 import wrappers as zoo_wrappers
 from rl_zoo3.utils import get_wrapper_class
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import (
-    SubprocVecEnv,
-    VecCheckNan,
-    VecFrameStack,
-    VecMonitor,
-    VecNormalize,
-)
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecCheckNan, VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_cgp.resumption.environments import RestorableEnv, environment_state, restore_environment
 

@@ -4,12 +4,7 @@ import pytest
 from ledgers import another
 from optuna.storages import InMemoryStorage
 from optuna.trial import TrialState
-from studies import (
-    GRACE,
-    Clock,
-    Heart,
-    make_sweep,
-)
+from studies import GRACE, Clock, Heart, make_sweep
 
 from benchmark.sweep import parse
 from benchmark.sweeps import worker_loop as worker

@@ -7,15 +7,7 @@ import torch as th
 from ledgers import trials_of
 from optuna.storages import InMemoryStorage
 from optuna.trial import TrialState
-from studies import (
-    Crew,
-    assert_each_run_once,
-    make_sweep,
-    mortal,
-    pretend_to_train,
-    pretend_to_train_group,
-    work_through,
-)
+from studies import Crew, assert_each_run_once, make_sweep, mortal, pretend_to_train, pretend_to_train_group, work_through
 
 from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.groups import Group
