@@ -21,7 +21,8 @@ from benchmark.common.files import write_json
 from benchmark.common.provenance import commit, machine
 from benchmark.compatibility.checking import check
 from benchmark.compatibility.installing import install, read_pins
-from benchmark.compatibility.packages import PACKAGES, Package
+from benchmark.compatibility.package_types import Package
+from benchmark.compatibility.packages import PACKAGES
 from benchmark.compatibility.page import page
 from sb3_cgp.common.files import write_atomically
 

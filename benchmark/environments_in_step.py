@@ -18,7 +18,7 @@ from benchmark.common.provenance import conditions
 from benchmark.speed.environment_page import markdown
 from benchmark.speed.environment_steps import measure
 from benchmark.speed.environment_ways import WAYS
-from sb3_cgp.population.environments import available_cores
+from sb3_cgp.population.processes import available_cores
 
 RECORDED = ("env", "seed", "rounds", "steps", "processes")
 

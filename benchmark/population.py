@@ -22,7 +22,7 @@ from benchmark.speed.card_estimates import estimate_all
 from benchmark.speed.population_methods import METHODS
 from benchmark.speed.population_points import measure_point, measure_product_rate, points_in_order
 from sb3_cgp.common.files import write_atomically
-from sb3_cgp.population.environments import available_cores
+from sb3_cgp.population.processes import available_cores
 
 # What is kept of an earlier call
 FOUND = ("points", "product_rate", "estimates")

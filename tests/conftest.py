@@ -1,5 +1,6 @@
 """What tests share: one thread; the CPU, so that the same is tested with and without a GPU; fixtures of several modules."""
 
+import os
 import shutil
 import signal
 from pathlib import Path
@@ -98,3 +99,105 @@ def clock(monkeypatch):
     clock = Clock()
     pretend(monkeypatch, clock)
     return clock
+
+
+@pytest.fixture
+def float64(monkeypatch):
+    """Networks in double precision, so that rounding does not decide between two samples of CEM."""
+    monkeypatch.setattr("stable_baselines3.common.policies.preprocess_obs", lambda obs, *args, **kwargs: obs.double())
+    th.set_default_dtype(th.float64)
+    yield
+    th.set_default_dtype(th.float32)
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    """Capture on the CPU, by the stand-in."""
+    from graph_models import StandIn
+
+    from sb3_cgp.fast import cuda_graph_algorithm, cuda_graphs
+
+    monkeypatch.setattr(cuda_graph_algorithm, "has_cuda_graphs", lambda device: True)
+    monkeypatch.setattr(cuda_graphs, "Recording", StandIn)
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
+    monkeypatch.setattr(StandIn, "made", 0)
+
+
+@pytest.fixture
+def work(tmp_path, monkeypatch):
+    """Tune in this process, which stands for one that its parent has started."""
+    # Here, as Optuna takes a second to import
+    from optuna.storages import InMemoryStorage
+    from tunings import arguments, tuner_of
+
+    from benchmark import tune
+    from benchmark.sweeps import tune_execution
+
+    monkeypatch.setattr("benchmark.sweeps.run.FINAL_EPISODES", 1)
+
+    def act(*argv, storage=None, grace=60.0, **options):
+        storage = storage or InMemoryStorage()
+        args = tune.parse(arguments(*argv, "--logs", str(tmp_path), "--parent", str(os.getppid()), **options))
+        own = tuner_of(args, storage, grace)
+        tune_execution.execute_trials(own, args)
+        return own.trials()
+
+    return act
+
+
+@pytest.fixture
+def pretend(monkeypatch):
+    """Let runs give what a function of the run says, and note them."""
+    runs = []
+
+    def act(score):
+        def train(run, folder, report, watch, device):
+            runs.append((run.method, run.seed))
+            return score(run)
+
+        monkeypatch.setattr("benchmark.sweeps.tuner.train", train)
+        return runs
+
+    return act
+
+
+@pytest.fixture
+def short_final_evaluation(monkeypatch):
+    """Evaluate a finished run in two episodes: this is most of a tiny run's time otherwise."""
+    for module in ("run", "population_run"):
+        monkeypatch.setattr(f"benchmark.sweeps.{module}.FINAL_EPISODES", 2)
+
+
+@pytest.fixture
+def ledger():
+    """A ledger of three runs: seeds 0 to 2."""
+    # Here, as Optuna takes a second to import
+    from ledgers import open_ledger
+    from optuna.storages import InMemoryStorage
+    from studies import Clock
+
+    return open_ledger(InMemoryStorage(), Clock())
+
+
+@pytest.fixture(scope="session")
+def drawn_studies(tmp_path_factory):
+    """Studies: of tasks, of an axis, of two axes, and of other methods than the rest; not to be written to."""
+    # Here, as Matplotlib takes a second to import
+    from finished_studies import BASELINES, GRID, runs, score, write_study
+
+    from benchmark.reporting.figures import figures, study_folders
+
+    folder = tmp_path_factory.mktemp("sweeps")
+    write_study(folder / "tasks", runs(score, [*BASELINES, "My-PPO"], tasks=("Pendulum-v1", "ALE/Pong-v5")))
+    write_study(folder / "axis", runs(score, BASELINES, [{"learning_rate": 0.01}, {"learning_rate": 0.001}]), planned=30)
+    write_study(folder / "axes", runs(score, BASELINES, GRID))
+    write_study(folder / "variants", runs(score, ["CGP-Online", "CGP-Offline"], GRID[:2]))
+    figures(study_folders(folder), folder, repetitions=100)
+    return folder
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Write empty files in place of pictures, for tests of what the page says."""
+    for name in ("curves_by_steps", "curves_by_minutes", "final_rewards", "stability", "sensitivity", "values"):
+        monkeypatch.setattr(f"benchmark.reporting.figures.{name}", lambda *args: b"")

@@ -4,15 +4,31 @@ import itertools
 
 import gymnasium as gym
 import numpy as np
+import pytest
 from gymnasium import spaces
 from stable_baselines3 import TD3
 from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cgp.guards import GuardedAlgorithm
 
 SMALL = dict(learning_starts=6, batch_size=8, buffer_size=1000, policy_kwargs=dict(net_arch=[4]), seed=0, device="cpu")
 
 ACTIONS = spaces.Box(-1, 1, (1,), np.float32)
+
+BUFFERS = {
+    "plain": dict(),
+    "n-step": dict(n_steps=3),
+    "memory-efficient": dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)),
+    "hindsight": dict(replay_buffer_class=HerReplayBuffer, learning_starts=16),
+}
+
+# SB3 and the guards warn of trainings as short as those of the tests
+IGNORED_WARNINGS = [
+    pytest.mark.filterwarnings("ignore:The last trajectory in the replay buffer will be truncated"),
+    pytest.mark.filterwarnings("ignore:Nothing is learnt"),
+    pytest.mark.filterwarnings("ignore:Evaluation environment is not wrapped"),
+]
 
 
 class GuardedTD3(GuardedAlgorithm, TD3):
@@ -55,6 +71,13 @@ class Located(gym.Env):
 
 def located(n_envs=1, **kwargs):
     return DummyVecEnv([lambda: Located(**kwargs)] * n_envs)
+
+
+def make_model(kind, n_envs=1, env=None, **kwargs):
+    """Make a model with a replay buffer of a kind of :data:`BUFFERS`."""
+    goals = kind == "hindsight"
+    policy = "MultiInputPolicy" if goals else "MlpPolicy"
+    return GuardedTD3(policy, located(n_envs, goals=goals) if env is None else env, **(SMALL | BUFFERS[kind] | kwargs))
 
 
 def assert_no_episode_runs_into_another(buffer, n_steps=1, gamma=0.99):

@@ -8,13 +8,13 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from environment_states import assert_same as assert_same_values
+from environment_states import check, go_on, start
 from environments import Doubles
 from gymnasium import spaces
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
-from test_environments import assert_same as assert_same_values
-from test_environments import check, go_on, start
 from trainings import Training, assert_same, fingerprint
 
 from sb3_cgp import RestorableEnv, register_restorable

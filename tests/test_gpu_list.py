@@ -14,7 +14,10 @@ import pytest
 import yaml
 
 from benchmark import gpu_list
-from benchmark.gpu_list import DONE, FAILED, STOPPED, TIME_OVER, Step, do_steps, execute, list_steps, parse
+from benchmark.common import listed_steps
+from benchmark.common.listed_steps import DONE, FAILED, STOPPED, Step, do_steps, execute
+from benchmark.common.measuring import TIME_OVER
+from benchmark.gpu_list import list_steps, parse
 from benchmark.sweeps.experiments import load_sweep
 from benchmark.sweeps.sharing import common_settings
 
@@ -28,7 +31,7 @@ class Fake:
     def __init__(self, monkeypatch, seconds=None, codes=None):
         self.now, self.seconds, self.codes = 0.0, seconds or {}, codes or {}
         self.calls = []
-        monkeypatch.setattr(gpu_list.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr(listed_steps.time, "monotonic", lambda: self.now)
 
     def __call__(self, command, log, seconds):
         self.calls.append((log.stem, list(command), seconds))
@@ -103,7 +106,7 @@ def test_a_rehearsal_leaves_the_list_to_do(tmp_path, monkeypatch):
     for options in (["--rehearse"], []):
         args = arguments(tmp_path, *options)
         do_steps(list_steps(args), args, fake)
-    assert fake.names[:3] == ["test_population", "population", "e6"]
+    assert fake.names[:3] == ["test_population_cuda_graphs", "population", "e6"]
     assert fake.names[8:] == [step.name for step in list_steps(arguments(tmp_path))]
 
 
@@ -196,7 +199,7 @@ def test_only_named_steps_are_done(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("ignores", "grace"), [(False, 20.0), (True, 0.2)])
 def test_a_command_is_asked_to_end_and_then_ended(tmp_path, monkeypatch, ignores, grace):
-    monkeypatch.setattr(gpu_list, "TO_END", grace)
+    monkeypatch.setattr(listed_steps, "TO_END", grace)
     handler = "signal.SIG_IGN" if ignores else "lambda *_: (print('saved', flush=True), exit(143))"
     code = f"import signal, time; signal.signal(signal.SIGTERM, {handler}); print('begun', flush=True); time.sleep(60)"
     start, log = time.monotonic(), tmp_path / "log"

@@ -5,12 +5,12 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
+from environment_states import assert_plain, check, start
 from environments import Doubles
 from gymnasium import spaces
 from rl_zoo3.utils import get_wrapper_class
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
-from test_environments import assert_plain, check, start
 from trainings import Training, assert_same, fingerprint
 
 from sb3_cgp import RestorableEnv

@@ -1,34 +1,18 @@
-"""Which runs of a study a process trains together: the rules, and what becomes of a group whose processes die."""
-
-from collections import Counter
+"""Which runs of a study a process takes, to train them together."""
 
 import pytest
-import torch as th
-import yaml
+from ledgers import another
 from optuna.storages import InMemoryStorage
 from optuna.trial import TrialState
-from studies import (
-    GRACE,
-    Clock,
-    Crew,
-    Heart,
-    assert_each_run_once,
-    make_sweep,
-    mortal,
-    pretend_to_train,
-    pretend_to_train_group,
-    work_through,
-)
+from studies import GRACE, Clock, Heart, make_sweep
 
 from benchmark.sweep import parse
 from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.execution import worker_command
-from benchmark.sweeps.experiments import load_sweep
-from benchmark.sweeps.groups import ON_GPU, Group, Groups, population_size
+from benchmark.sweeps.groups import ON_GPU, Groups, population_size
 from benchmark.sweeps.run import begin, run_folder
-from benchmark.sweeps.sharing import common_settings
 from benchmark.sweeps.studies import Ledger
-from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME, POPULATION
+from benchmark.sweeps.study_trials import POPULATION
 from benchmark.worker import parse as parse_worker
 from sb3_cgp.resumption.store import StateStore
 
@@ -39,10 +23,6 @@ def ledger():
     ledger = Ledger(InMemoryStorage(), "study", GRACE, Clock())
     ledger.open(make_sweep(["Good"], seeds=4), {"experiment": "tiny"})
     return ledger
-
-
-def another(ledger):
-    return Ledger(ledger.storage, ledger.name, GRACE, ledger._silence._clock)
 
 
 def claim(ledger, logs, size):
@@ -60,97 +40,6 @@ def lose(ledger, *silent):
                 ledger.storage.set_trial_user_attr(trial_id, "progress", {"beat": f"{second}"})
         ledger.recover()
         clock.sleep(5)
-
-
-# --- Which runs may share a process ---
-
-
-@pytest.fixture
-def runs_of(tmp_path):
-    """Make the runs of a sweep of two methods, A and B."""
-
-    def make(a, b, **fields):
-        methods = {name: {"algo": "cgp", "hyperparams": {"policy": "MlpPolicy"}} | {"tuned": False} for name in ("A", "B")}
-        for name, changes in (("A", a), ("B", b)):
-            changes = dict(changes)
-            methods[name]["algo"] = changes.pop("algo", "cgp")
-            methods[name]["tuned"] = changes.pop("tuned", False)
-            methods[name]["hyperparams"] |= changes
-        content = dict(title="A sweep", methods=methods, tasks=["Pendulum-v1"], steps=1_000, seeds=1, evaluation_interval=50)
-        path = tmp_path / "mine.yml"
-        path.write_text(yaml.safe_dump(content | fields))
-        return load_sweep(str(path)).runs()
-
-    return make
-
-
-NOISE = dict(noise_type="normal", noise_std=0.1)
-
-
-@pytest.mark.parametrize(
-    ("a", "b", "may_share"),
-    [
-        ({}, {}, True),
-        (dict(learning_rate=0.01, gamma=0.9, tau=0.1), dict(learning_rate="lin_0.001", target_noise_clip=0.1), True),
-        (dict(policy_delay=2), dict(policy_delay=3, target_update_interval=1), True),
-        (dict(learning_starts=10), dict(learning_starts=100), True),
-        (NOISE, NOISE | dict(noise_std=0.3), True),
-        (NOISE, {}, False),
-        (NOISE, NOISE | dict(noise_type="ornstein-uhlenbeck"), False),
-        ({}, dict(batch_size=32), False),
-        ({}, dict(cem_samples=32), False),
-        ({}, dict(n_steps=3), False),
-        ({}, dict(policy_kwargs="dict(net_arch=[64])"), False),
-        ({}, dict(policy_loss="qgp"), False),
-        ({}, dict(policy_training="offline"), False),
-        ({}, dict(algo="td3"), False),
-        (dict(algo="td3"), dict(algo="td3", tau=0.1), True),
-        (dict(algo="ddpg"), dict(algo="ddpg", learning_rate=0.1), True),
-        (dict(algo="td3"), dict(algo="ddpg"), False),
-        # The entry of Pendulum-v1 sets the same numbers, and other shapes
-        (dict(tuned=True), dict(tuned=True, gamma=0.9), True),
-        (dict(tuned=True), dict(), False),
-    ],
-)  # fmt: skip
-def test_runs_share_a_process_that_differ_in_numbers_and_seeds_alone(runs_of, a, b, may_share):
-    runs = [common_settings(run) for run in runs_of(a, b, seeds=2)]
-    assert None not in runs
-    # A and B, with two seeds each
-    assert runs[:2] == runs[2:]
-    assert (runs[0] == runs[1]) == may_share
-
-
-@pytest.mark.parametrize(
-    "hyperparams",
-    [
-        dict(algo="sac"),
-        dict(algo="tqc"),
-        dict(algo="crossq"),
-        dict(algo="ppo"),
-        dict(algo="random"),
-        dict(normalize=True),
-        dict(n_envs=2),
-        dict(frame_stack=2),
-        dict(train_freq=[1, "episode"]),
-        dict(cem_dtype="bfloat16"),
-        dict(optimize_memory_usage=True),
-        dict(policy="sb3_cgp.core.policies.CGPPolicy"),
-        dict(callback="stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes"),
-    ],
-)
-def test_runs_that_a_population_cannot_train_are_trained_alone(runs_of, hyperparams):
-    shared = {name: value for name, value in hyperparams.items() if name != "algo"}
-    assert {common_settings(run) for run in runs_of(hyperparams, {"algo": hyperparams.get("algo", "cgp")} | shared)} == {None}
-
-
-def test_runs_on_other_tasks_or_of_other_lengths_do_not_share_a_process(runs_of):
-    first = runs_of({}, {})
-    others = [runs_of({}, {}, steps=2_000, evaluation_interval=50), runs_of({}, {}, evaluation_interval=100),
-              runs_of({}, {}, evaluation_episodes=3), runs_of({}, {}, tasks=["MountainCarContinuous-v0"])]  # fmt: skip
-    assert len({common_settings(runs[0]) for runs in (first, *others)}) == 5
-
-
-# --- What a process takes ---
 
 
 @pytest.mark.parametrize(("size", "groups"), [(1, [[0], [1], [2], [3]]), (3, [[0, 1, 2], [3]]), (8, [[0, 1, 2, 3]])])
@@ -267,123 +156,6 @@ def test_the_size_of_a_population(monkeypatch):
         assert parse_worker(worker_command(args, "study")[3:]).population == args.population
     with pytest.raises(SystemExit):
         parse(["e6", "--population", "0"])
-
-
-# --- No run is skipped and none counts twice ---
-
-
-def trials_of(storage):
-    return storage.get_all_trials(storage.get_study_id_from_name("study"))
-
-
-@pytest.mark.parametrize("takes_effect", [False, True])
-def test_a_process_with_a_group_may_die_at_any_call(clock, tmp_path, takes_effect):
-    sweep = make_sweep()
-    calls = 0
-    while True:
-        storage, logs = InMemoryStorage(), tmp_path / str(calls)
-        has_died = mortal(storage, sweep, clock, logs, calls, takes_effect, population=3)
-        work_through(storage, sweep, clock, logs, population=3)
-        assert_each_run_once(trials_of(storage), sweep)
-        if not has_died:
-            break
-        calls += 1
-    assert calls > 40
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_processes_with_groups_side_by_side_may_die_lose_answers_and_be_away(clock, tmp_path, seed):
-    sweep = make_sweep(seeds=3)
-    storage = InMemoryStorage()
-    Crew(seed, storage, clock, population=1 + seed % 5).work(sweep, tmp_path, n_processes=3, n_deaths=seed % 8, n_steps=20_000)
-    assert_each_run_once(trials_of(storage), sweep)
-
-
-def test_a_group_that_fails_as_a_whole_is_trained_run_by_run(clock, tmp_path, monkeypatch):
-    sweep, storage, tried = make_sweep(), InMemoryStorage(), []
-
-    def train_group(group, *args):
-        pretend_to_train_group(Group(group.folder, group.runs), *args)
-        raise RuntimeError("a simulator died")
-
-    def train(run, *args):
-        tried.append(run.key)
-        return pretend_to_train(run, *args)
-
-    monkeypatch.setattr(worker, "train_group", train_group)
-    monkeypatch.setattr(worker, "train", train)
-    work_through(storage, sweep, clock, tmp_path, population=8)
-    trials = trials_of(storage)
-    assert_each_run_once(trials, sweep)
-    outcomes = Counter(trial.user_attrs.get(OUTCOME) for trial in trials)
-    # "Bad" has failed in the group already
-    assert outcomes == {None: 4, "dissolved: RuntimeError: a simulator died": 2}
-    assert sorted(tried) == ["Good,Pendulum-v1,seed=0", "Good,Pendulum-v1,seed=1"]
-    assert not list((tmp_path / "study" / "populations").iterdir())
-    assert {trial.user_attrs[KEY] for trial in trials if ERROR in trial.user_attrs} == {
-        "Bad,Pendulum-v1,seed=0", "Bad,Pendulum-v1,seed=1"
-    }  # fmt: skip
-
-
-@pytest.mark.parametrize("lack", [MemoryError, getattr(th, "AcceleratorError", th.OutOfMemoryError), ChildProcessError])
-def test_what_the_machine_lacks_gives_a_group_back(clock, tmp_path, monkeypatch, lack):
-    storage = InMemoryStorage()
-
-    def train_group(*args):
-        raise lack
-
-    with monkeypatch.context() as patch:
-        patch.setattr(worker, "train_group", train_group)
-        with pytest.raises(lack):
-            work_through(storage, make_sweep(), clock, tmp_path, population=8)
-    assert Counter(trial.state for trial in trials_of(storage)) == {TrialState.FAIL: 4, TrialState.WAITING: 4}
-    work_through(storage, make_sweep(), clock, tmp_path, population=8)
-    assert_each_run_once(trials_of(storage), make_sweep())
-
-
-@pytest.mark.parametrize("population", [1, 8])
-def test_states_that_a_killed_process_has_left_are_removed_at_the_end_of_the_study(clock, tmp_path, monkeypatch, population):
-    def train(run, folder, *args):
-        begin(run, folder)
-        StateStore(folder / "state").save(1, {})
-        return pretend_to_train(run, folder, *args)
-
-    def killed(*args):
-        raise SystemExit
-
-    storage, sweep = InMemoryStorage(), make_sweep(["Good"])
-    monkeypatch.setattr(worker, "train", train)
-    with monkeypatch.context() as patch:
-        patch.setattr(worker, "_forget", killed)
-        for _ in range(2):
-            with pytest.raises(SystemExit):
-                work_through(storage, sweep, clock, tmp_path, population)
-            if population > 1:
-                break
-    assert list(tmp_path.rglob("state-*.json"))
-    work_through(storage, sweep, clock, tmp_path, population)
-    assert_each_run_once(trials_of(storage), sweep)
-    assert not list(tmp_path.rglob("state-*.json"))
-
-
-def test_states_are_removed_before_another_process_may_continue_from_them(clock, tmp_path, monkeypatch):
-    events = []
-
-    class Lock:
-        def __init__(self, path):
-            events.append("locked")
-
-        def __enter__(self):
-            pass
-
-        def __exit__(self, *exception):
-            events.append("released")
-
-    forget = worker._forget
-    monkeypatch.setattr(worker, "FileLock", Lock)
-    monkeypatch.setattr(worker, "_forget", lambda *args: events.append("removed") or forget(*args))
-    work_through(InMemoryStorage(), make_sweep(["Good"]), clock, tmp_path, population=8)
-    assert events == ["locked", "locked", "removed", "released", "released"]
 
 
 def test_a_process_that_was_taken_for_lost_leaves_the_states_to_its_successor(ledger, tmp_path, monkeypatch):

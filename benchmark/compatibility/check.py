@@ -2,10 +2,10 @@
 A check of CGP on one environment, a script for the virtual environment that has the environment's package.
 
 ``python check.py PART FOLDER`` reads ``environment.json`` in the folder, a dictionary of the fields of
-:class:`~benchmark.compatibility.packages.Environment`, and writes ``PART.json`` there. The parts are processes of their own:
-``whole`` is a training without a stop, after which the model predicts, is saved, loaded and exported; ``stopped`` is the same
-training, ended by an exception after it has saved its state; ``resumed`` continues from that state; ``learnt`` is a longer
-training, which is compared with random actions.
+:class:`~benchmark.compatibility.package_types.Environment`, and writes ``PART.json`` there. The parts are processes of their
+own: ``whole`` is a training without a stop, after which the model predicts, is saved, loaded and exported; ``stopped`` is the
+same training, ended by an exception after it has saved its state; ``resumed`` continues from that state; ``learnt`` is a
+longer training, which is compared with random actions.
 
 The module imports nothing of ``benchmark``, which needs more packages than the virtual environment has.
 """

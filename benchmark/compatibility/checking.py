@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmark.common.files import write_json
-from benchmark.compatibility.packages import Environment
+from benchmark.compatibility.package_types import Environment
 from benchmark.compatibility.processes import execute
 from benchmark.compatibility.texts import in_a_line
 

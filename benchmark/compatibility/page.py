@@ -6,7 +6,8 @@ from statistics import mean
 from typing import Any
 
 from benchmark.common.tables import markdown_table
-from benchmark.compatibility.packages import PACKAGES, Environment, Package
+from benchmark.compatibility.package_types import Environment, Package
+from benchmark.compatibility.packages import PACKAGES
 
 HEADER = ("environment", "policy, buffer, wrappers", "trains", "resumes", "exports", "steps/s", "learns")
 TOP = """\

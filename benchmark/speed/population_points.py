@@ -20,7 +20,7 @@ from benchmark.speed.operations import bare_products, total_flops
 from benchmark.speed.population_counts import count_step
 from benchmark.speed.population_methods import Dimensions, make_population
 from benchmark.speed.timing import summary, timed
-from sb3_cgp.population.environments import make_population_env
+from sb3_cgp.population import make_population_env
 
 # Of each agent. Enough for the measured steps, in as much memory as many agents can have
 BUFFER_SIZE = 20_000

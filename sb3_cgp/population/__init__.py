@@ -29,7 +29,8 @@ so is the selection of actions in a rollout.
 
 from sb3_cgp.population.algorithm import Population
 from sb3_cgp.population.callbacks import PopulationEvalCallback, evaluate_population
-from sb3_cgp.population.environments import ChunkedSubprocVecEnv, make_population_env
+from sb3_cgp.population.environments import ChunkedSubprocVecEnv
+from sb3_cgp.population.make_environments import make_population_env
 
 __all__ = [
     "ChunkedSubprocVecEnv",

@@ -1,109 +1,19 @@
 """Environments of a population: a few processes, each of which steps several environments."""
 
 import multiprocessing as mp
-import os
-import signal
 from collections.abc import Callable, Sequence
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_cgp.common.rules import require, require_choice, require_count
+from sb3_cgp.common.rules import require
 from sb3_cgp.guards.workers import GRACE, end_workers
-from sb3_cgp.resumption.environments import RestorableEnv
-
-
-def available_cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def make_population_env(
-    env_id: str | Callable[..., gym.Env],
-    n_agents: int,
-    n_processes: int | None = None,
-    seed: int | None = None,
-    wrapper_class: Callable[[gym.Env], gym.Env] | None = None,
-    wrapper_kwargs: dict[str, Any] | None = None,
-    start_method: str | None = None,
-    **kwargs: Any,
-) -> VecEnv:
-    """
-    Make the environments of a population, as SB3's ``make_vec_env`` does, in processes that step several of them each.
-
-    They can be restored: :class:`~sb3_cgp.RestorableEnv` is the outermost wrapper of each.
-
-    :param env_id: either the env ID, the env class or a callable returning an env
-    :param n_agents: number of environments, one for each agent
-    :param n_processes: number of processes, at most ``n_agents``; 1 for a ``DummyVecEnv``, which steps them in this process;
-        None for one process for each core that this process may use
-    :param seed: the seed of the first environment; those of the next ones count from it
-    :param wrapper_class: a wrapper, or a function that wraps an environment
-    :param wrapper_kwargs: the wrapper's keyword arguments
-    :param start_method: how processes are started, see :class:`ChunkedSubprocVecEnv`
-    :param kwargs: the further arguments of ``make_vec_env``, such as ``env_kwargs``
-    :return: the environments
-    :raises ValueError: if a number is out of its range, or the start method or an argument is not allowed
-    :raises RuntimeError: if a process ends before it has made its environments
-    """
-    for name in ("vec_env_cls", "vec_env_kwargs"):
-        allowed = "left out: `n_processes` chooses the class; SB3's `make_vec_env` makes environments of another one"
-        require(name not in kwargs, name, kwargs.get(name), allowed)
-    require_count("n_agents", n_agents)
-    check_start_method(start_method)
-    if n_processes is None:
-        n_processes = min(available_cores(), n_agents)
-    check_processes(n_processes, n_agents)
-
-    def wrap(env: gym.Env) -> gym.Env:
-        return RestorableEnv(env if wrapper_class is None else wrapper_class(env, **(wrapper_kwargs or {})))
-
-    in_processes: dict[str, Any] = {}
-    if n_processes > 1:
-        chunks = {"n_processes": n_processes, "start_method": start_method}
-        in_processes = {"vec_env_cls": ChunkedSubprocVecEnv, "vec_env_kwargs": chunks}
-    return make_vec_env(env_id, n_agents, seed, wrapper_class=wrap, **in_processes, **kwargs)
-
-
-def check_processes(n_processes: int, n_envs: int) -> None:
-    """
-    Check a number of processes.
-
-    :param n_processes: number of processes
-    :param n_envs: number of environments
-    :raises ValueError: if it is out of its range
-    """
-    require_count("n_processes", n_processes)
-    require(n_processes <= n_envs, "n_processes", n_processes, f"at most {n_envs}, the number of environments")
-
-
-def check_start_method(start_method: str | None) -> None:
-    """
-    Check how processes are to be started.
-
-    :param start_method: the start method; None for the default
-    :raises ValueError: if this platform does not have it
-    """
-    if start_method is not None:
-        require_choice("start_method", start_method, mp.get_all_start_methods())
-
-
-def chunk_bounds(n_envs: int, n_processes: int) -> list[tuple[int, int]]:
-    """
-    Share environments out among processes, in order, as evenly as possible.
-
-    :param n_envs: number of environments
-    :param n_processes: number of processes
-    :return: the first environment of each process, and the first one of the next process
-    """
-    return [(index * n_envs // n_processes, (index + 1) * n_envs // n_processes) for index in range(n_processes)]
+from sb3_cgp.population.environment_worker import step_chunk
+from sb3_cgp.population.processes import available_cores, check_processes, check_start_method, chunk_bounds
 
 
 class ChunkedSubprocVecEnv(SubprocVecEnv):
@@ -141,7 +51,7 @@ class ChunkedSubprocVecEnv(SubprocVecEnv):
         for (start, stop), remote, work_remote in zip(self._bounds, self.remotes, self.work_remotes, strict=True):
             arguments = (work_remote, remote, CloudpickleWrapper(list(env_fns[start:stop])))
             # A daemon ends with the main process
-            process = context.Process(target=_step_chunk, args=arguments, daemon=True)
+            process = context.Process(target=step_chunk, args=arguments, daemon=True)
             process.start()
             self.processes.append(process)
             work_remote.close()
@@ -314,40 +224,6 @@ class ChunkedSubprocVecEnv(SubprocVecEnv):
         :param state: the state
         """
         self._seeds, self._options = state["seeds"], state["options"]
-
-
-def _step_chunk(remote: Connection, parent_remote: Connection, env_fns: CloudpickleWrapper) -> None:
-    """Answer the requests of a :class:`ChunkedSubprocVecEnv` about the environments of one process."""
-    # Ctrl-C in a terminal reaches all processes: the main process still needs the environments to save its state, and ends
-    # this one. A forked process has the main process's handler of SIGTERM.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    parent_remote.close()
-    envs = DummyVecEnv(env_fns.var)
-    while True:
-        try:
-            command, data = remote.recv()
-            if command == "step":
-                remote.send((*envs.step(data), envs.reset_infos))
-            elif command == "reset":
-                envs._seeds, envs._options = data
-                remote.send((envs.reset(), envs.reset_infos))
-            elif command == "call":
-                method, args, kwargs = data
-                remote.send(getattr(envs, method)(*args, **kwargs))
-            elif command == "has_attr":
-                remote.send(envs.has_attr(data))
-            elif command == "get_spaces":
-                remote.send((envs.observation_space, envs.action_space))
-            elif command == "render":
-                remote.send(envs.get_images())
-            else:
-                # "close"
-                envs.close()
-                remote.close()
-                break
-        except EOFError:
-            break
 
 
 def _concatenate(observations: Sequence[Any]) -> Any:

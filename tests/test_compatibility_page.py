@@ -1,0 +1,81 @@
+"""The page on other packages' environments, and their declarations."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+from compatibility_records import WRITTEN, rows_of
+
+from benchmark import environments
+from benchmark.compatibility import check
+from benchmark.compatibility.package_types import Environment, Learning, Package
+from benchmark.compatibility.packages import PACKAGES
+from benchmark.compatibility.page import page
+
+
+def test_a_page_has_returns_successes_and_what_was_noticed(monkeypatch):
+    learning = Learning(3_000, {})
+    package = Package(
+        "works", ("works<2",), ("works",), (Environment("Works-v0", "env = 1", learning=learning),), ("A note.",)
+    )
+    monkeypatch.setattr("benchmark.compatibility.page.PACKAGES", (package,))
+    found = {
+        **WRITTEN,
+        "resumes": "differs",
+        "repeats": False,
+        "returns": [-1.0, -2.0],
+        "random_returns": [-50.0, -49.0],
+        "successes": 19,
+        "random_successes": 0,
+        "observations": "Box([-1. 0.], [1. inf], (2,), float32)",
+        "why_not_restorable": "a.Simulator is unknown and has no get_training_state(): it needs x. b.C is unknown and has no "
+        "get_training_state(): it needs x.",
+    }
+    record = {
+        "package": "works",
+        "installation": {"pins": "all", "seconds": 1.0},
+        "environments": {"Works-v0": found},
+        "versions": {"works": "1.2"},
+        "other_versions": {},
+        "python": "3.11.7",
+        "commit": "abc",
+        "machine": {"cpu": "A processor", "cores": 2},
+        "load_average": 3.4,
+    }
+    text = page({"works": record})
+    cells = ["differs", "yes (0e+00)", "80 (12,346)", "-49.5 → -1.5; 0 → 19 of 20 (3,000 steps)"]
+    assert rows_of(text)["works: Works-v0"][2:] == cells
+    for line in (
+        '`pip install "works<2"`',
+        "- Tested: works 1.2, with Python 3.11.7. No version differs from constraints.txt.",
+        "- A note.",
+        "- Observations: `Box([...], [...], (2,), float32)`; actions: `Box(1,)`.",
+        "- Not restored: the state of a.Simulator, b.C is unknown "
+        "([what helps](environments.md#environments-of-other-packages)).",
+        "Commit abc, on A processor, 2 cores, load average 3.",
+        "- Two trainings with one seed differ: the environment does not repeat itself.",
+    ):
+        assert line in text.splitlines()
+
+
+def test_the_page_of_the_documentation_is_that_of_the_records():
+    root = Path(__file__).parent.parent
+    records = [json.loads(path.read_text()) for path in (root / "benchmark/results/environments").glob("*.json")]
+    assert records
+    # Where the command writes it
+    assert f"`{environments.parse([]).folder / 'environments.md'}`" in page({})
+    assert (root / "docs/tested_environments.md").read_text() == page({record["package"]: record for record in records})
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.name)
+def test_a_declaration_is_whole(package):
+    ids = [environment.id for environment in package.environments]
+    assert ids
+    assert len(set(ids)) == len(ids)
+    assert all(name == name.lower().replace("_", "-") for name in package.distributions)
+    for environment in package.environments:
+        compile(environment.code, environment.id, "exec")
+        assert "\nenv = " in environment.code
+        assert environment.replay_buffer in (None, *check.REPLAY_BUFFERS)
+        json.dumps(asdict(environment))

@@ -1,0 +1,103 @@
+"""``python -m benchmark.figures``: which studies it takes, mistakes, and the commands that it prints."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from finished_studies import BASELINES, GRID, runs, score, write_study
+
+from benchmark import sweep
+from benchmark.common.measuring import measuring_parser
+from benchmark.figures import main
+from benchmark.reporting import figures as command
+from benchmark.reporting.figures import figures
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def folder(drawn_studies: Path) -> Path:
+    return drawn_studies
+
+
+def test_mistakes_are_named(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit, match="is no folder; to take a study of that name from a storage"):
+        main(["e33", "--folder", str(tmp_path)])
+    with pytest.raises(SystemExit, match=r"is no folder of a study: study.json is missing"):
+        main([str(tmp_path), "--folder", str(tmp_path)])
+    with pytest.raises(SystemExit, match="have the same name: axis, axis"):
+        main([str(folder / "axis"), str(folder / "axis"), "--folder", str(tmp_path)])
+    with pytest.raises(SystemExit):
+        main([str(folder / "axis"), "--repetitions", "0", "--folder", str(tmp_path)])
+    assert "'0' is not an integer >= 1" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_all_studies_of_a_folder(folder: Path, tmp_path: Path) -> None:
+    for study in ("axis", "axes"):
+        shutil.copytree(folder / study, tmp_path / study)
+    options = ["--folder", str(tmp_path), "--repetitions", "20"]
+    main(options)
+    page = (tmp_path / "results.md").read_text()
+    assert "## Pendulum-v1: The study axis, " in page
+    assert "## Pendulum-v1: The study axes, " in page
+    # As the shell has them in the place of a star, the folder of the figures among them
+    folders = [f"{path}/" for path in sorted(tmp_path.iterdir()) if path.is_dir()]
+    assert str(tmp_path / "figures/") in [path.rstrip("/") for path in folders]
+    main([*folders, *options])
+    assert (tmp_path / "results.md").read_text() == page
+    with pytest.raises(SystemExit, match="holds no study"):
+        main(["--folder", str(tmp_path / "axis")])
+
+
+def test_named_study_is_taken_from_its_storage(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def export_study(name: str, storage: str, results: Path) -> Path:
+        assert storage == "sqlite:///studies.db"
+        if name != "mine":
+            raise KeyError(name)
+        return write_study(results / name, runs(score, BASELINES, GRID[:2]))
+
+    monkeypatch.setitem(sys.modules, "benchmark.sweeps.exports", SimpleNamespace(export_study=export_study))
+    options = ["--storage", "sqlite:///studies.db", "--folder", str(tmp_path), "--repetitions", "20"]
+    main(["mine", *options])
+    assert "The study mine" in (tmp_path / "results.md").read_text()
+    with pytest.raises(SystemExit, match=r"The storage sqlite:///studies\.db holds no study yours"):
+        main(["yours", *options])
+
+
+def test_printed_sweep_commands_name_a_folder_that_is_not_the_default(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    for out, option in (
+        ("tracked/my sweeps", " --results 'tracked/my sweeps'`"),
+        (command.FOLDER.as_posix(), "benchmark.sweep mine`"),
+    ):
+        study = write_study(make(tmp_path / out / "mine"), runs(score, BASELINES[:1]))
+        text = figures([study], tmp_path / out, 20).read_text()
+        (line,) = [line for line in text.splitlines() if line.startswith("The runs: ")]
+        assert option in line
+        assert ("--results" in line) == ("--results" in option)
+
+
+@pytest.mark.skipif(shutil.which("git") is None or not (ROOT / ".git").exists(), reason="needs a clone")
+def test_the_results_of_a_user_are_not_tracked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    folders = [sweep.parse(["e3"]).results, command.FOLDER, measuring_parser("runtime", "").parse_args([]).folder]
+    assert folders == [Path("results/sweeps"), Path("results/sweeps"), Path("results/runtime")]
+    for folder in folders:
+        assert subprocess.run(["git", "check-ignore", "-q", f"{folder}/results.md"], cwd=ROOT, check=False).returncode == 0
+    tracked = "benchmark/results/sweeps/results.md"
+    assert subprocess.run(["git", "check-ignore", "-q", tracked], cwd=ROOT, check=False).returncode == 1
+
+
+def make(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    return folder
+
+
+def test_default_folder_is_left_out_of_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    line = command.command_line([command.FOLDER / "e3"], tmp_path / command.FOLDER, command.REPETITIONS)
+    assert line == "python -m benchmark.figures results/sweeps/e3"

@@ -1,0 +1,117 @@
+"""Vectorised environments of other packages: arrays that they overwrite, and what they lack."""
+
+import numpy as np
+import pytest
+from guarded import IGNORED_WARNINGS, SMALL, GuardedTD3, Located, assert_no_episode_runs_into_another, located, make_model
+from stable_baselines3 import TD3
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor, VecNormalize
+
+pytestmark = IGNORED_WARNINGS
+
+
+class Overwriting(VecEnvWrapper):
+    """Returns one array, which it overwrites at the next step, as an environment for GPUs or in shared memory may."""
+
+    def reset(self):
+        self.shared = self.venv.reset()
+        return self.shared
+
+    def step_wait(self):
+        observations, *others = self.venv.step_wait()
+        self.shared[:] = observations
+        return self.shared, *others
+
+
+def test_an_array_that_the_environment_overwrites_is_copied():
+    model = make_model("n-step", env=Overwriting(located(2)))
+    model.learn(30)
+    model.learn(30, reset_num_timesteps=False)
+    assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)
+    assert model.replay_buffer.dones.sum() == 2 * (30 // 7)
+
+
+class Reusing(Located):
+    """Keeps its observation in one array, which `reset` overwrites."""
+
+    def __init__(self):
+        super().__init__()
+        self.array = np.zeros(2, np.float32)
+
+    def observe(self):
+        self.array[:] = self.episode, self.steps
+        return self.array
+
+
+def test_a_final_observation_that_reset_overwrites_is_copied():
+    model = make_model("n-step", env=DummyVecEnv([Reusing, Reusing]))
+    model.learn(60)
+    assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)
+    ends = model.replay_buffer.dones[:30] == 1
+    np.testing.assert_array_equal(model.replay_buffer.next_observations[:30][ends][:, 1], 7)
+
+
+class Foreign(VecEnv):
+    """A vectorised environment of another package, which keeps neither actions nor infos, as simulators on a GPU."""
+
+    def __init__(self, infos):
+        self.inner, self.infos = Located(), infos
+        super().__init__(1, self.inner.observation_space, self.inner.action_space)
+
+    @property
+    def reset_infos(self):
+        return None if self.infos is None else [{}]
+
+    @reset_infos.setter
+    def reset_infos(self, infos):
+        pass
+
+    def reset(self):
+        return self.inner.reset()[0][None]
+
+    def step_async(self, actions):
+        self.given = actions
+
+    def step_wait(self):
+        observation, reward, terminated, truncated, info = self.inner.step(self.given[0])
+        if terminated or truncated:
+            info = {"terminal_observation": observation, "TimeLimit.truncated": truncated}
+            observation = self.inner.reset()[0]
+        return observation[None], np.array([reward]), np.array([terminated or truncated]), [info]
+
+    def close(self):
+        pass
+
+    def get_attr(self, attr_name, indices=None):
+        return [getattr(self.inner, attr_name)]
+
+    def set_attr(self, attr_name, value, indices=None):
+        raise NotImplementedError
+
+    def env_method(self, method_name, *args, indices=None, **kwargs):
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class, indices=None):
+        return [False]
+
+
+class ToSimulator(VecEnvWrapper):
+    """Says that what it wraps is a simulator, as a robot's package does."""
+
+    @property
+    def unwrapped(self):
+        return object()
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+
+@pytest.mark.parametrize("infos", [None, "new ones"])
+@pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor, VecNormalize, ToSimulator])
+def test_environments_of_other_packages_are_trained_on_as_by_sb3(infos, wrap):
+    guarded, plain = (algorithm("MlpPolicy", wrap(Foreign(infos)), **SMALL).learn(30) for algorithm in (GuardedTD3, TD3))
+    assert guarded._n_updates == plain._n_updates == 24
+    np.testing.assert_array_equal(guarded.replay_buffer.dones, plain.replay_buffer.dones)
+    assert_no_episode_runs_into_another(guarded.replay_buffer) if wrap is not VecNormalize else None

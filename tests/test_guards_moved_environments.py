@@ -1,0 +1,108 @@
+"""An environment that a callback, another training or an evaluation moves during a training."""
+
+import numpy as np
+import pytest
+from guarded import IGNORED_WARNINGS, SMALL, GuardedTD3, Located, assert_no_episode_runs_into_another, located, make_model
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from trainings import Do
+
+pytestmark = IGNORED_WARNINGS
+
+
+@pytest.mark.parametrize(
+    "vec_env", [DummyVecEnv, lambda fns: SubprocVecEnv(fns, start_method="fork")], ids=["here", "workers"]
+)
+@pytest.mark.parametrize("normalises", [False, True])
+@pytest.mark.parametrize("what", ["nested training", "evaluation", "reset"])
+def test_an_environment_that_a_callback_moves_begins_an_episode(vec_env, normalises, what):
+    env = vec_env([Located, Located])
+    env = VecNormalize(env, norm_obs=False) if normalises else env
+    model = make_model("n-step", env=env)
+
+    def move():
+        if what == "nested training":
+            GuardedTD3("MlpPolicy", env, **SMALL).learn(16)
+        elif what == "evaluation":
+            evaluate_policy(model, env, n_eval_episodes=1)
+        else:
+            env.reset()
+
+    with pytest.warns(UserWarning, match="was reset or stepped outside of this training, at environment step 16") as warned:
+        model.learn(40, [Do(8, move), Do(14, move)])
+    # Each training is told once
+    assert len([each for each in warned if "outside of this training" in str(each.message)]) == 1
+    assert model.num_timesteps == 40
+    assert "_save_obs" not in vars(env.unwrapped)
+    assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)
+    # The step in which the callback moved it was made too
+    observations = model.replay_buffer.observations[:20]
+    assert np.all(model.replay_buffer.next_observations[:20, :, 1] == observations[:, :, 1] + 1)
+    env.close()
+
+
+@pytest.mark.parametrize("index", [0, 1, 2])
+@pytest.mark.parametrize("when", ["step", "reset"])
+def test_replies_of_workers_that_an_interruption_left_unread_are_not_taken_for_others(index, when):
+    env = SubprocVecEnv([Located] * 3, start_method="fork")
+    model = make_model("n-step", env=env).learn(18)
+    remote = env.remotes[index]
+
+    def fail():
+        del remote.recv
+        raise KeyboardInterrupt
+
+    def interrupt():
+        remote.recv = fail
+
+    if when == "step":
+        with pytest.raises(KeyboardInterrupt):
+            model.learn(30, Do(4, interrupt), reset_num_timesteps=False)
+    else:
+        interrupt()
+        with pytest.raises(KeyboardInterrupt):
+            env.reset()
+    model.learn(30, reset_num_timesteps=False)
+    model.learn(30)
+    assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)
+    env.close()
+
+
+def test_nested_trainings_leave_the_environment_as_it_was():
+    env = located()
+    inner = make_model("plain", env=env)
+    outer = make_model("plain", env=env)
+    outer.learn(15, Do(5, lambda: inner.learn(10, Do(5, lambda: make_model("plain", env=env).learn(9)))))
+    assert "_save_obs" not in vars(env)
+    assert "reset" not in vars(env.envs[0])
+    for model in (outer, inner):
+        assert_no_episode_runs_into_another(model.replay_buffer)
+
+
+@pytest.mark.parametrize("within", ["Monitor", "TimeLimit"])
+@pytest.mark.parametrize("when", ["between", "in a callback"])
+def test_an_environment_that_is_shared_with_an_evaluation_is_noticed(within, when):
+    env = Monitor(Located(50)) if within == "Monitor" else TimeLimit(Located(50), 20)
+    model = make_model("n-step", env=env)
+    # In a vectorised environment of its own
+    evaluation = DummyVecEnv([lambda: env])
+    if when == "between":
+        model.learn(15)
+        evaluate_policy(model, evaluation, n_eval_episodes=1, warn=False)
+        model.learn(15, reset_num_timesteps=False)
+    else:
+        with pytest.warns(UserWarning, match="The training environment was reset or stepped outside of this training"):
+            model.learn(30, callback=Do(15, lambda: evaluate_policy(model, evaluation, n_eval_episodes=1, warn=False)))
+    assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)
+
+
+def test_an_environment_that_a_callback_sets_within_a_step_is_refused():
+    model = make_model("plain")
+    with pytest.raises(RuntimeError, match="`set_env` was called by a callback in the middle of a step"):
+        model.learn(30, callback=Do(15, lambda: model.set_env(located())))
+    model.set_env(located())
+    model.learn(20, reset_num_timesteps=False)
+    assert np.isfinite(model.replay_buffer.observations).all()
+    assert_no_episode_runs_into_another(model.replay_buffer)

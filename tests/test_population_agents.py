@@ -1,0 +1,82 @@
+"""A population's agents as ordinary models: they predict, are saved and exported, and train on."""
+
+import functools
+
+import numpy as np
+import pytest
+import torch as th
+from populations import AGENTS, Pushed, assert_alike, make
+
+from sb3_cgp import CGP
+
+
+def test_an_agent_predicts_as_it_does_in_the_population():
+    population = make(3).learn(3 * 60)
+    observations = np.random.default_rng(0).normal(size=(3, 3))
+    actions, _ = population.predict(observations)
+    for index, agent in enumerate(population):
+        np.testing.assert_allclose(agent.predict(observations[index])[0], actions[index], atol=1e-6)
+
+
+def test_an_agent_saves_loads_and_exports(tmp_path):
+    pytest.importorskip("onnx")
+    pytest.importorskip("safetensors")
+    population = make(AGENTS).learn(3 * 60)
+    observation = np.ones(3)
+    for index in (0, 1):
+        agent = population[index]
+        expected, _ = agent.predict(observation)
+        agent.save(tmp_path / "agent")
+        loaded = CGP.load(tmp_path / "agent")
+        np.testing.assert_array_equal(loaded.predict(observation)[0], expected)
+        assert (loaded.gamma, loaded.tau, loaded._n_updates) == (agent.gamma, agent.tau, (40, 38)[index])
+        assert_alike(loaded, agent, rtol=0, atol=0)
+        agent.export(tmp_path / f"export{index}")
+        exported, _ = CGP.load_weights(tmp_path / f"export{index}").predict(observation)
+        np.testing.assert_allclose(exported, expected, atol=1e-5)
+
+
+def test_a_copy_of_an_agent_changes_neither_the_population_nor_its_random_numbers():
+    def train(copies):
+        population = make(2)
+        population.learn(2 * 40)
+        if copies:
+            agent = population.agent(0, env=Pushed())
+            agent.learn(30, reset_num_timesteps=False)
+            assert agent._n_updates == 20 + 30
+        return population
+
+    th.manual_seed(0)
+    population = train(True)
+    expected = train(False)
+    for name, value in expected.policy.state_dict().items():
+        assert th.equal(population.policy.state_dict()[name], value)
+    np.testing.assert_array_equal(population.replay_buffer.actions, expected.replay_buffer.actions)
+    state = th.get_rng_state()
+    population[0]
+    assert th.equal(th.get_rng_state(), state)
+
+
+def test_an_agent_goes_on_from_its_own_transitions():
+    population = make(3).learn(3 * 40)
+    agent = population.agent(1, env=Pushed())
+    np.testing.assert_array_equal(agent.replay_buffer.actions[:40, 0], population.replay_buffer.actions[:40, 1])
+    assert (agent.replay_buffer.n_envs, agent.replay_buffer.size(), agent.replay_buffer.buffer_size) == (1, 40, 500)
+    agent.learn(20, reset_num_timesteps=False)
+    assert (agent.num_timesteps, agent._n_updates, agent.replay_buffer.size()) == (60, 40, 60)
+
+
+@pytest.mark.filterwarnings("ignore:The policy's loss has not reached a plateau")
+def test_offline_training_trains_each_agents_actor_at_the_end(monkeypatch):
+    monkeypatch.setattr(CGP, "train_policy", functools.partialmethod(CGP.train_policy, max_steps=300))
+    population = make(2, policy_training="offline", learning_rate=1e-2)
+    before = list(population)
+    assert population.policy.inference == "cem"
+    population.learn(2 * 40)
+    assert population.policy.inference == "actor"
+    for index, agent in enumerate(population):
+        assert agent.policy.inference == "actor"
+        observations = th.as_tensor(population.replay_buffer.observations[:40, index])
+        target = agent.policy.select_actions(observations, agent.critic).actions
+        errors = [(each.actor(observations) - target).square().mean().item() for each in (agent, before[index])]
+        assert errors[0] < 0.85 * errors[1]

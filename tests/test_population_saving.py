@@ -1,0 +1,62 @@
+"""A population that is saved, loaded or resumed goes on as if it had not stopped."""
+
+import numpy as np
+import pytest
+import torch as th
+from populations import AGENTS, VARIANTS, assert_alike, make, make_env
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+
+from sb3_cgp import TrainingCheckpointCallback
+from sb3_cgp.population import Population
+
+
+def test_a_population_is_saved_and_loaded(tmp_path):
+    population = make(AGENTS).learn(3 * 60)
+    population.save(tmp_path / "population")
+    population.save_replay_buffer(tmp_path / "buffer")
+    loaded = Population.load(tmp_path / "population", env=make_env())
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    observations = np.random.default_rng(0).normal(size=(3, 3))
+    np.testing.assert_array_equal(loaded.predict(observations)[0], population.predict(observations)[0])
+    for index, agent in enumerate(loaded):
+        assert_alike(agent, population[index], rtol=0, atol=0)
+        assert (agent.gamma, agent.policy_delay) == (population[index].gamma, population[index].policy_delay)
+    loaded.learn(3 * 20, reset_num_timesteps=False)
+    assert list(loaded._agent_updates) == [60, 58, 60]
+    with pytest.raises(ValueError, match="`tau`"):
+        Population.load(tmp_path / "population", tau=0.5)
+    assert len(Population.load(tmp_path / "population")) == 3
+
+
+class Stop(BaseCallback):
+    """Stops the training at a step."""
+
+    def __init__(self, at):
+        super().__init__()
+        self.at = at
+
+    def _on_step(self):
+        return self.num_timesteps < self.at
+
+
+@pytest.mark.filterwarnings("ignore:A test_population_saving.Stop was among the callbacks")
+@pytest.mark.parametrize("variant", ["CGP", "TD3"])
+def test_a_population_resumes_as_if_it_had_not_stopped(variant, tmp_path):
+    noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), 0.3 * np.ones(1))
+    agents = [own | dict(action_noise=noise) for own in AGENTS]
+
+    def train(folder, *callbacks):
+        callbacks = [TrainingCheckpointCallback(3 * 20, folder), *callbacks]
+        return make(agents, env="Pendulum-v1", **VARIANTS[variant]).learn(3 * 90, callback=callbacks)
+
+    whole = train(tmp_path / "whole")
+    train(tmp_path / "stopped", Stop(3 * 70))
+    resumed = Population.resume(tmp_path / "stopped", make_vec_env("Pendulum-v1", 3))
+    assert resumed.num_timesteps == 180
+    resumed.learn(3 * 90)
+    assert list(resumed._agent_updates) == list(whole._agent_updates)
+    for name, value in whole.policy.state_dict().items():
+        assert th.equal(resumed.policy.state_dict()[name], value), name
+    np.testing.assert_array_equal(resumed.replay_buffer.actions, whole.replay_buffer.actions)

@@ -1,0 +1,161 @@
+"""Selectors besides the paper's CEM in a training of CGP."""
+
+import math
+
+import oracles
+import pytest
+import torch as th
+from scores import Seen
+from torch import nn
+
+import sb3_cgp.core.policies as core_policies
+from sb3_cgp import CEM, CGP, MlpPolicy
+from sb3_cgp.fast.scoring import q_score
+from sb3_cgp.selectors import MPPI, ActorCEM, ActorOnly, ActorStart
+
+LIGHT = dict(cem_start="actor", cem_iterations=1, cem_samples=16)
+
+
+def make_model(**kwargs):
+    arguments = dict(learning_starts=50, buffer_size=1_000, batch_size=16, seed=0, policy_kwargs=dict(net_arch=[16]))
+    return CGP("MlpPolicy", "Pendulum-v1", **(arguments | kwargs))
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: ActorCEM(actor_fraction=1.5), "fraction"),
+        (lambda: ActorCEM(actor_std=-1.0), "std"),
+        (lambda: ActorCEM(samples=3), "elites"),
+        (lambda: ActorStart(math.nan), "fraction"),
+        (lambda: MPPI(temperature=0.0), "temperature"),
+        (lambda: MPPI(temperature="hot"), "temperature"),
+        (lambda: MPPI(elites=100), "elites"),
+        (lambda: MPPI(start="actor"), "start"),
+        (lambda: make_model(cem_start="policy"), "cem_start"),
+        (lambda: make_model(cem_start="actor", cem_actor_fraction=-0.1), "cem_actor_fraction"),
+        (lambda: make_model(cem_start="actor", cem_actor_std=math.inf), "cem_actor_std"),
+        (lambda: make_model(cem_start="actor", policy_loss=None), "cem_start"),
+        (lambda: make_model(cem_start="actor", policy_kwargs=dict(selector=CEM())), "cem_start"),
+        (lambda: make_model(policy_kwargs=dict(actor_proposes=True)), "policy_kwargs['actor_proposes']"),
+        (lambda: make_model(policy_kwargs=dict(selector=ActorOnly())), "policy_loss"),
+        (lambda: make_model(policy_loss=None, policy_kwargs=dict(selector=ActorOnly())), "policy_loss"),
+        (
+            lambda: make_model(policy_loss="qgp", policy_training="offline", policy_kwargs=dict(selector=ActorOnly())),
+            "policy_training",
+        ),
+        (lambda: ActorOnly().select(Seen(), 1, 1), "proposals"),
+        (lambda: CGP(core_policies.CGPPolicy, "Pendulum-v1", cem_start="actor", buffer_size=10), "policy"),
+    ],
+)
+def test_wrong_arguments_are_refused_by_name(make, name):
+    with pytest.raises(ValueError, match="must be") as error:
+        make()
+    assert f"`{name}`" in str(error.value)
+
+
+def record_proposals(model):
+    """Replace a model's selector by one that keeps the proposals that it is given."""
+    given = []
+
+    class Recording(ActorCEM):
+        def select(self, score, n_states, action_dim, device="cpu", proposals=None):
+            given.append(None if proposals is None else proposals.clone())
+            return super().select(score, n_states, action_dim, device, proposals)
+
+    model.policy.selector = Recording(1, 16, 6)
+    return given
+
+
+def test_acting_and_the_loss_start_from_the_actor_and_bootstrap_actions_from_the_averaged_one():
+    model = make_model(**LIGHT, tau=0.5).learn(70)
+    given = record_proposals(model)
+    model.policy.set_training_mode(False)
+    batch = model.replay_buffer.sample(16)
+    with th.no_grad():
+        actor, averaged = model.actor(batch.observations), model.actor_target(batch.next_observations)
+    assert not th.allclose(model.actor_target(batch.observations), actor)
+    model.policy.select_actions(batch.observations, model.critic)
+    model.policy.select_actions(batch.next_observations, model.critic_target)
+    assert th.equal(given[0][:, 0], actor)
+    assert th.equal(given[1][:, 0], averaged)
+    given.clear()
+    # One environment step and one gradient step: acting, bootstrap actions, the policy's loss
+    model.learn(1, reset_num_timesteps=False)
+    assert [proposals.shape for proposals in given] == [(1, 1, 1), (16, 1, 1), (16, 1, 1)]
+
+
+def test_the_actor_proposes_in_evaluation_mode_and_keeps_its_mode():
+    class Dropped(nn.Sequential):
+        def __init__(self):
+            super().__init__(nn.Dropout(0.5), nn.BatchNorm1d(3))
+
+    model = make_model(**LIGHT).learn(60)
+    model.actor.mu = nn.Sequential(Dropped(), *model.actor.mu)
+    model.policy.set_training_mode(True)
+    statistics = model.actor.mu[0][1].running_mean.clone()
+    given = record_proposals(model)
+    observations = th.rand(8, 3)
+    for _ in range(2):
+        model.policy.select_actions(observations, model.critic)
+    assert th.equal(given[0], given[1])
+    assert th.equal(model.actor.mu[0][1].running_mean, statistics)
+    assert model.actor.training
+    assert model.actor.mu[0].training
+
+
+def test_offline_the_prior_alone_serves_until_the_actor_is_trained(monkeypatch):
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
+    given, select = [], ActorCEM.select
+
+    def recording(self, score, n_states, action_dim, device="cpu", proposals=None):
+        given.append(proposals is not None)
+        return select(self, score, n_states, action_dim, device, proposals)
+
+    monkeypatch.setattr(ActorCEM, "select", recording)
+    model = make_model(**LIGHT, policy_training="offline", diagnostics=False).learn(60)
+    first = given.index(True)
+    # At least 10 choices of rollouts and 10 of bootstrap actions, and then the policy's training alone
+    assert first >= 20
+    assert all(given[first:])
+    assert len(given) - first == model.actor.optimizer.state[next(model.actor.parameters())]["step"]
+    assert model.policy.actor_proposes
+
+
+def test_a_models_setting_is_saved_and_a_policys_too(tmp_path):
+    model = make_model(**LIGHT, cem_actor_fraction=0.25, cem_actor_std=0.1).learn(60)
+    model.save(tmp_path / "model")
+    loaded = CGP.load(tmp_path / "model")
+    assert repr(loaded.policy.selector) == repr(model.policy.selector)
+    assert (loaded.policy.selector.start.fraction, loaded.policy.selector.start.std) == (0.25, 0.1)
+    changed = CGP.load(tmp_path / "model", cem_start="prior")
+    assert type(changed.policy.selector) is CEM
+    model.policy.actor_proposes = False
+    model.policy.save(tmp_path / "policy")
+    policy = MlpPolicy.load(tmp_path / "policy")
+    assert repr(policy.selector) == repr(model.policy.selector)
+    assert policy.actor_proposes is False
+
+
+@pytest.mark.parametrize("policy_loss", ["cgp", "qgp"])
+@pytest.mark.parametrize("selector", [MPPI(1, 16), MPPI(2, 8, start=ActorStart()), ActorCEM(2, 8, 3)])
+def test_cgp_trains_by_every_selector(selector, policy_loss):
+    model = make_model(policy_loss=policy_loss, policy_kwargs=dict(net_arch=[16], selector=selector)).learn(100)
+    assert model._n_updates == 50
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+
+
+@pytest.mark.parametrize("n_samples", [4, 16])
+@pytest.mark.parametrize("dtype", [th.float32, th.bfloat16])
+def test_few_samples_are_scored_as_the_network_does(n_samples, dtype):
+    th.manual_seed(0)
+    network = nn.Sequential(nn.Linear(5, 64), nn.ReLU(), nn.Linear(64, 64), nn.ReLU(), nn.Linear(64, 1))
+    features, actions = th.randn(32, 3), th.rand(32, n_samples, 2) * 2 - 1
+    with th.no_grad():
+        values = q_score(network, features, dtype)(actions)
+    layers = network[::2]
+    for state in range(0, 32, 5):
+        for index in range(n_samples):
+            inputs = th.cat([features[state], actions[state, index]])
+            expected = oracles.mlp([layer.weight for layer in layers], [layer.bias for layer in layers], inputs).item()
+            assert values[state, index].item() == pytest.approx(expected, abs=1e-5 if dtype == th.float32 else 2e-2)

@@ -1,0 +1,67 @@
+"""A study's settings: with which it is opened again, and how trials show them."""
+
+import pytest
+from ledgers import look_for, open_ledger, trials_of
+from optuna.storages import InMemoryStorage, RDBStorage
+from optuna.trial import TrialState
+from studies import GRACE, Clock
+
+from benchmark.sweeps.study_trials import KEY, distributions_of, with_seed
+from benchmark.sweeps.validation import SweepError
+
+
+def test_a_study_is_not_opened_with_other_settings(ledger):
+    with pytest.raises(SweepError, match=r"'study': steps: was 100 and is now 200 for Good.*--study"):
+        open_ledger(ledger.storage, Clock(), steps=200)
+    with pytest.raises(SweepError, match=r"'study': has other methods, tasks or axes.*--study"):
+        open_ledger(ledger.storage, Clock(), tasks=["Reacher-v5"])
+    assert len(ledger.trials()) == 3
+    assert {trial.user_attrs["run"]["steps"] for trial in ledger.trials()} == {100}
+
+
+def test_a_study_may_get_more_seeds_and_more_of_its_methods(ledger):
+    open_ledger(ledger.storage, Clock())
+    assert len(ledger.trials()) == 3
+    open_ledger(ledger.storage, Clock(), seeds=5)
+    assert [trial.user_attrs["run"]["seed"] for trial in ledger.trials()] == [0, 1, 2, 3, 4]
+    open_ledger(ledger.storage, Clock(), methods=["Other"], seeds=[7])
+    assert ledger.trials()[-1].user_attrs[KEY] == "Other,Pendulum-v1,seed=7"
+
+
+def test_a_trial_shows_its_name_and_its_seed_and_the_seed_is_no_parameter(ledger):
+    """optuna-dashboard shows attributes as columns, sorts by numbers, and takes parameters alone for its importances."""
+    assert [set(trial.params) for trial in ledger.trials()] == [{"method", "task"}] * 3
+    assert [trial.user_attrs["seed"] for trial in ledger.trials()] == [0, 1, 2]
+    assert ledger.trials()[0].user_attrs[KEY] == "Good,Pendulum-v1,seed=0"
+
+
+def test_a_study_of_an_earlier_version_goes_on_with_the_seed_as_a_parameter(monkeypatch):
+    storage = InMemoryStorage()
+    with monkeypatch.context() as patch:
+        patch.setattr("benchmark.sweeps.studies.distributions_of", lambda sweep: with_seed(distributions_of(sweep)))
+        first = open_ledger(storage, Clock())
+    assert [trial.params["seed"] for trial in first.trials()] == [0, 1, 2]
+    claim = first.claim("worker")
+    first.release(claim)
+    later = open_ledger(storage, Clock(), seeds=4)
+    assert [trial.params["seed"] for trial in later.trials()] == [0, 1, 2, 0, 3]
+    assert len({str(trial.distributions) for trial in later.trials()}) == 1
+    with pytest.raises(SweepError, match="has other methods, tasks or axes"):
+        open_ledger(storage, Clock(), tasks=["Reacher-v5"])
+
+
+def test_hyperparameters_that_json_changes_are_the_same(ledger):
+    sweep = dict(hyperparams={"policy_kwargs": {1: (2, 3)}}, seeds=1)
+    storage = InMemoryStorage()
+    open_ledger(storage, Clock(), **sweep)
+    rdb = RDBStorage("sqlite:///:memory:")
+    open_ledger(rdb, Clock(), **sweep)
+    open_ledger(rdb, Clock(), **sweep)
+    assert len(trials_of(rdb)) == 1
+
+
+def test_trials_of_others_are_left_alone(ledger):
+    ledger.storage.create_new_trial(ledger.study_id)
+    assert len(ledger.trials()) == 3
+    look_for(ledger, GRACE + 5)
+    assert trials_of(ledger.storage)[-1].state is TrialState.RUNNING

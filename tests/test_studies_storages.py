@@ -1,0 +1,119 @@
+"""Storages of studies: patience with a database that is away, those that are none, and Optuna's proxy."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+from ledgers import forked
+from optuna.exceptions import StorageInternalError
+from studies import GRACE, assert_each_run_once, make_sweep, pretend_to_train
+
+from benchmark.sweeps import worker_loop as worker
+from benchmark.sweeps.heartbeats import PROGRESS
+from benchmark.sweeps.storages import open_storage, patiently
+from benchmark.sweeps.studies import Ledger
+from benchmark.sweeps.worker_loop import execute_runs
+
+
+@pytest.mark.parametrize("error", [StorageInternalError, ConnectionError])
+def test_patience_with_a_database_that_is_away(clock, error):
+    answers = iter([error("away")] * 6)
+
+    def call(argument):
+        answer = next(answers, None)
+        if answer is not None:
+            raise answer
+        return argument
+
+    assert patiently(call, "there") == "there"
+    # Twice as long each time, up to five seconds
+    assert clock.now == pytest.approx(0.1 + 0.2 + 0.4 + 0.8 + 1.6 + 3.2)
+
+
+def test_patience_has_an_end(clock):
+    def call():
+        raise StorageInternalError("away")
+
+    with pytest.raises(StorageInternalError):
+        patiently(call, patience=20.0)
+    assert 10 < clock.now <= 20
+
+
+def test_no_patience_with_other_errors(clock):
+    def call():
+        raise KeyError("no such study")
+
+    with pytest.raises(KeyError):
+        patiently(call)
+    assert clock.now == 0
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("grpc://localhost", "must have a host and a port"),
+        ("studies.db", "must be a database's URL"),
+        ("nosuchdatabase://localhost/x", "must be a database's URL"),
+        ("sqlite://", "in the memory of one process, but must be one that other processes reach, such as sqlite:///"),
+        ("sqlite:///", "in the memory of one process"),
+        ("sqlite:///:memory:", "in the memory of one process"),
+        ("sqlite+pysqlite:///:memory:", "in the memory of one process"),
+        ("sqlite:///file::memory:?cache=shared&uri=true", "in the memory of one process"),
+        ("sqlite:///file:mine?mode=memory&uri=true", "in the memory of one process"),
+    ],
+)
+def test_a_storage_that_is_none(url, message):
+    with pytest.raises(ValueError, match=message):
+        open_storage(url)
+
+
+def test_processes_that_make_a_database_at_once(tmp_path):
+    for attempt in range(3):
+        url = f"sqlite:///{tmp_path}/{attempt}/studies.db"
+        children = [forked(lambda url=url: open_storage(url).get_all_studies()) for _ in range(4)]
+        assert [os.waitpid(child, 0)[1] for child in children] == [0] * 4
+
+
+PROXY = """
+import optuna, sys
+optuna.storages.run_grpc_proxy_server(optuna.storages.get_storage(sys.argv[1]), host="127.0.0.1", port=int(sys.argv[2]))
+"""
+
+
+def test_by_way_of_optunas_proxy(monkeypatch, tmp_path):
+    """... which is killed in the middle, and comes back."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-c", PROXY, f"sqlite:///{tmp_path}/studies.db", str(port)]
+    sweep = make_sweep(seeds=3)
+    servers = []
+
+    def serve():
+        servers.append(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+
+    def train(run, *args):
+        if run.seed == 2 and len(servers) == 1:
+            servers[0].kill()
+            servers[0].wait()
+            serve()
+        return pretend_to_train(run, *args)
+
+    monkeypatch.setattr(worker, "train", train)
+    serve()
+    try:
+        storage = open_storage(f"grpc://127.0.0.1:{port}")
+        ledger = Ledger(storage, "study", GRACE)
+        ledger.open(sweep, {"experiment": sweep.name})
+        execute_runs(ledger, tmp_path, "a process")
+        assert len(servers) == 2
+        assert_each_run_once(ledger.trials(), sweep)
+        assert len(ledger.records()) == 6
+        assert all("beat" in trial.user_attrs[PROGRESS] for trial in ledger.trials())
+    finally:
+        for server in servers:
+            server.send_signal(signal.SIGKILL)
+            server.wait()
