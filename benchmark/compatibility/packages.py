@@ -79,7 +79,6 @@ def made(env_id: str, imported: str = "", arguments: str = "", replayed: bool = 
     return "\n".join([*lines, f"env = make_vec_env({', '.join(given)})"])
 
 
-REPLAYED = "Without `replayed`, which repeats the interrupted episode, a resumed training begins a new one."
 HINDSIGHT: dict[str, Any] = dict(policy="MultiInputPolicy", replay_buffer="HerReplayBuffer")
 # As `hyperparams/cgp.yml` has them
 SMALL: dict[str, Any] = dict(learning_starts=1_000, buffer_size=10_000, policy_kwargs=dict(net_arch=[64, 64]))
@@ -179,7 +178,6 @@ PACKAGES = (
                 "LunarLanderContinuous-v3",
                 made("LunarLanderContinuous-v3", replayed=True),
                 wrappers="`replayed`",
-                notes=(REPLAYED,),
             ),
             Environment(
                 "CarRacing-v3",
@@ -254,7 +252,6 @@ PACKAGES = (
                 "gym_pusht/PushT-v0",
                 made("gym_pusht/PushT-v0", "gym_pusht", 'env_kwargs=dict(obs_type="state")', replayed=True),
                 wrappers="`replayed`",
-                notes=(REPLAYED,),
             ),
         ),
     ),
@@ -268,7 +265,6 @@ PACKAGES = (
                 made("parking-v0", "highway_env", replayed=True),
                 wrappers="`replayed`",
                 notes=(
-                    REPLAYED,
                     "Other tasks have discrete actions by default; "
                     '`env_kwargs=dict(config={"action": {"type": "ContinuousAction"}})` makes them continuous.',
                 ),
@@ -285,13 +281,11 @@ PACKAGES = (
                 "InvertedPendulumBulletEnv-v0",
                 made("InvertedPendulumBulletEnv-v0", "pybullet_envs_gymnasium", replayed=True),
                 wrappers="`replayed`",
-                notes=(REPLAYED,),
             ),
             Environment(
                 "HalfCheetahBulletEnv-v0",
                 made("HalfCheetahBulletEnv-v0", "pybullet_envs_gymnasium", replayed=True),
                 wrappers="`replayed`",
-                notes=(REPLAYED,),
             ),
         ),
     ),
