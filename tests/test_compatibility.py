@@ -117,7 +117,8 @@ def test_what_fails_crashes_or_hangs_stays_alone(stand_in, fakes, tmp_path):
     assert table["shaky: Fine-v0"] == table["shaky: segfaults"]
     assert "- It was not installed: setup.py: swig is missing" in text
     assert "The package contradicts constraints.txt. Other than there: numpy 0.9 (there " in text
-    assert "- Failed (stops): the process ended by SIGSEGV" in text
+    spaces = "Observations: `Box(3,)`; actions: `Box(1,)`."
+    assert f"- **segfaults**: {spaces} Failed (stops): the process ended by SIGSEGV" in text
     assert str(tmp_path) not in text
 
 

@@ -12,29 +12,30 @@ HEADER = ("environment", "policy, buffer, wrappers", "trains", "resumes", "expor
 TOP = """\
 # Tested environments
 
-CGP trains on the environments of these packages from PyPI. Make an environment by the code of its package's section, and pass it
-to `CGP(policy, env)`, with the policy and the `replay_buffer_class` that the table names. For an environment that is not in the
-table, see [your own environment](environments.md).
+CGP trains on the environments of these packages from PyPI. Make an environment by the code of its package's section, and
+pass it to `CGP(policy, env)`, with the policy and the `replay_buffer_class` that the table names. For an environment that is
+not in the table, see [your own environment](environments.md).
 """
 NOTES = """\
 - **trains**: CGP was trained for 220 steps, 110 of them random, with its default networks and batch size and a small replay
   buffer. The model then predicted actions within the bounds, was saved, and predicted the same when it was loaded.
-- **resumes**: a training that was stopped after step 163, and resumed by another process, was compared with one that was not stopped.
-  "bit for bit": both end with identical networks, optimizers, replay buffer and counters. "from a new episode": the environment's
-  state cannot be restored, so that the resumed training begins a new episode, and a warning says so. "differs": the trainings
-  differ without a warning. `replayed` restores an environment by [repeating the interrupted
+- **resumes**: a training that was stopped after step 163, and resumed by another process, was compared with one that was not
+  stopped. "bit for bit": both end with identical networks, optimizers, replay buffer and counters. "from a new episode": the
+  environment's state cannot be restored, so that the resumed training begins a new episode, and a warning says so.
+  "differs": the trainings differ without a warning. `replayed` restores an environment by [repeating the interrupted
   episode](environments.md#simulators-whose-state-cannot-be-read); without it, the training is resumed from a new episode.
-- **exports**: `model.export` worked. In brackets: the largest difference between the actions of `predict` and those of the exported
-  policy, as a share of the action space's width.
-- **steps/s**: environment steps per second of processor time, on one thread, with one gradient step per step. In brackets: the
-  environment alone, with random actions. Where the load average of a section exceeds the number of cores, both are too low.
-- **learns**: the mean return of 20 episodes, first by random actions, then by the actor after a training of that many steps; and
-  how many of the episodes were successful, where the environment reports it. The arguments are in
+- **exports**: `model.export` worked. In brackets: the largest difference between the actions of `predict` and those of the
+  exported policy, as a share of the action space's width.
+- **steps/s**: environment steps per second of processor time, on one thread, with one gradient step per step. In brackets:
+  the environment alone, with random actions. Where the load average of a section exceeds the number of cores, both are too
+  low.
+- **learns**: the mean return of 20 episodes, first by random actions, then by the actor after a training of that many steps;
+  and how many of the episodes were successful, where the environment reports it. The arguments are in
   `benchmark/compatibility/packages.py`.
 - "–": not checked, or the check was interrupted.
 
-`make test-environments` installs each package into a virtual environment of its own, repeats the checks, and writes the records and
-this page to `results/environments/environments.md`.
+`make test-environments` installs each package into a virtual environment of its own, repeats the checks, and writes the
+records and this page to `results/environments/environments.md`.
 """
 UNKNOWN = "–"
 
@@ -131,7 +132,7 @@ def _section(package: Package, record: dict[str, Any]) -> str:
 
 
 def _code(package: Package) -> str:
-    """Return the code that makes the package's environments: the imports of all, then a line for each, if each has one line."""
+    """Return the code that makes the package's environments: if each takes one line, all imports, and then these lines."""
     parts = [environment.code.rpartition("\n\n") for environment in package.environments]
     if len(parts) == 1 or any("\n" in last for _, _, last in parts):
         return "\n\n\n".join(environment.code for environment in package.environments)
