@@ -76,18 +76,19 @@ def test_what_fails_crashes_or_hangs_stays_alone(stand_in, fakes, tmp_path):
     shaky = records["shaky"]["environments"]
     assert shaky["segfaults"]["errors"] == {"stopped": {"stops": "the process ended by SIGSEGV"}}
     assert shaky["sleeps"]["errors"] == {"whole": {"starts": "the process ended by the time limit of 2 seconds"}}
-    assert (shaky["Fine-v0"]["errors"], shaky["Fine-v0"]["resumes"]) == ({}, "to the bit")
+    assert (shaky["Fine-v0"]["errors"], shaky["Fine-v0"]["resumes"]) == ({}, "bit for bit")
     assert records["old"]["installation"]["pins"] == ["torch", "stable-baselines3"]
     assert list((tmp_path / "work").glob("*/venv")) == []
     text = (tmp_path / "records" / "environments.md").read_text()
     table = rows_of(text)
     assert table["broken: Broken-v0"] == ["MlpPolicy", "not installed", "–", "–", "–", "–"]
     assert table["shaky: sleeps"] == ["MlpPolicy", "no", "–", "–", "–", "–"]
-    assert table["shaky: segfaults"] == ["MlpPolicy", "yes", "to the bit", "yes (0e+00)", "80 (12,346)", "not tested"]
+    assert table["shaky: segfaults"] == ["MlpPolicy", "yes", "bit for bit", "yes (0e+00)", "80 (12,346)", "not tested"]
     assert table["shaky: Fine-v0"] == table["shaky: segfaults"]
     assert "- It was not installed: setup.py: swig is missing" in text
     assert "The package contradicts constraints.txt. Other than there: numpy 0.9 (there " in text
-    assert "- Failed (stops): the process ended by SIGSEGV" in text
+    spaces = "Observations: `Box(3,)`; actions: `Box(1,)`."
+    assert f"- **segfaults**: {spaces} Failed (stops): the process ended by SIGSEGV" in text
     assert str(tmp_path) not in text
 
 
@@ -108,8 +109,8 @@ def test_a_crash_at_the_end_of_a_process_is_not_one_of_the_training(stand_in, tm
         # The second check does not repeat the part
         found = checking.check(environment, stand_in, tmp_path / "aborts", 10, reuse=True)
         assert found["errors"] == {"whole": {"ends": "the process ended by SIGABRT"}}
-        assert found["resumes"] == "to the bit"
-        assert page_module._cells(environment, found)[:2] == ["yes", "to the bit"]
+        assert found["resumes"] == "bit for bit"
+        assert page_module._cells(environment, found)[:2] == ["yes", "bit for bit"]
 
 
 def test_a_record_is_not_replaced_by_one_of_fewer_environments(stand_in, fakes, tmp_path, monkeypatch):

@@ -66,7 +66,7 @@ def checked(folder: Path, code: str, *parts: str, **fields: object) -> dict:
 @pytest.mark.parametrize(
     ("code", "resumes", "repeats"),
     [
-        (COUNTS + METHODS.format(restored="state"), "to the bit", True),
+        (COUNTS + METHODS.format(restored="state"), "bit for bit", True),
         (COUNTS + METHODS.format(restored="state + 0.01"), "differs", True),
         (COUNTS, "from a new episode", True),
         (UNSEEDED + METHODS.format(restored="state"), "differs", False),

@@ -105,7 +105,7 @@ def test_records_from_before_the_time_was_measured(tmp_path: Path) -> None:
 
 def test_published_returns_are_hollow_markers_at_their_steps(tmp_path: Path, drawn: list[Figure]) -> None:
     chosen = study(tmp_path, [timed("TD3", seed, None, task="HalfCheetah-v5") for seed in range(2)], steps=100_000)
-    assert "Hollow markers are mean returns from the literature" in draw(chosen, 20)[0].caption
+    assert "Open markers are mean returns from the literature" in draw(chosen, 20)[0].caption
     drawn.clear()
     curves_by_steps(chosen, "HalfCheetah-v5", 20)
     (panel,) = drawn[0].axes

@@ -58,8 +58,8 @@ def summary(found: dict[str, dict[str, Any]]) -> dict[str, Any]:
     Compare the parts.
 
     :param found: what each has written, by part
-    :return: the errors and warnings of all; whether two trainings of one seed are the same to the bit ("repeats"); how the
-        training was resumed ("resumes": "to the bit", "from a new episode", "differs", or None if it was not); and all other
+    :return: the errors and warnings of all; whether two trainings of one seed are the same bit for bit ("repeats"); how the
+        training was resumed ("resumes": "bit for bit", "from a new episode", "differs", or None if it was not); and all other
         values as they were written
     """
     compared = ("at_stop", "at_end", "versions", "warnings", "errors", "doing", "complete")
@@ -75,7 +75,7 @@ def summary(found: dict[str, dict[str, Any]]) -> dict[str, Any]:
     elif row.get("why_not_restorable") is not None:
         row["resumes"] = "from a new episode"
     else:
-        row["resumes"] = "to the bit" if is_same else "differs"
+        row["resumes"] = "bit for bit" if is_same else "differs"
     return row
 
 

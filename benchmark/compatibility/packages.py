@@ -4,7 +4,6 @@ from typing import Any
 
 from benchmark.compatibility.package_types import Environment, Learning, Package, made
 
-REPLAYED = "Without `replayed`, which repeats the interrupted episode, a resumed training begins a new one."
 HINDSIGHT: dict[str, Any] = dict(policy="MultiInputPolicy", replay_buffer="HerReplayBuffer")
 # As `hyperparams/cgp.yml` has them
 SMALL: dict[str, Any] = dict(learning_starts=1_000, buffer_size=10_000, policy_kwargs=dict(net_arch=[64, 64]))
@@ -104,7 +103,6 @@ PACKAGES = (
                 "LunarLanderContinuous-v3",
                 made("LunarLanderContinuous-v3", replayed=True),
                 wrappers="`replayed`",
-                notes=(REPLAYED,),
             ),
             Environment(
                 "CarRacing-v3",
@@ -179,7 +177,6 @@ PACKAGES = (
                 "gym_pusht/PushT-v0",
                 made("gym_pusht/PushT-v0", "gym_pusht", 'env_kwargs=dict(obs_type="state")', replayed=True),
                 wrappers="`replayed`",
-                notes=(REPLAYED,),
             ),
         ),
     ),
@@ -193,7 +190,6 @@ PACKAGES = (
                 made("parking-v0", "highway_env", replayed=True),
                 wrappers="`replayed`",
                 notes=(
-                    REPLAYED,
                     "Other tasks have discrete actions by default; "
                     '`env_kwargs=dict(config={"action": {"type": "ContinuousAction"}})` makes them continuous.',
                 ),
@@ -210,13 +206,11 @@ PACKAGES = (
                 "InvertedPendulumBulletEnv-v0",
                 made("InvertedPendulumBulletEnv-v0", "pybullet_envs_gymnasium", replayed=True),
                 wrappers="`replayed`",
-                notes=(REPLAYED,),
             ),
             Environment(
                 "HalfCheetahBulletEnv-v0",
                 made("HalfCheetahBulletEnv-v0", "pybullet_envs_gymnasium", replayed=True),
                 wrappers="`replayed`",
-                notes=(REPLAYED,),
             ),
         ),
     ),

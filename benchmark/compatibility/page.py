@@ -13,27 +13,30 @@ HEADER = ("environment", "policy, buffer, wrappers", "trains", "resumes", "expor
 TOP = """\
 # Tested environments
 
-CGP on the environments of other packages. Each package is installed from PyPI into a virtual environment of its own, and each
-environment is checked there. `make test-environments` does both, and writes its page, with the records, to
-`results/environments/environments.md`. The `env` of a section's code is trained on by `CGP(policy, env)`, with the policy and
-the `replay_buffer_class` that the table names. [Your own environment](environments.md) says what CGP needs of one.
+CGP trains on the environments of these packages from PyPI. Make an environment by the code of its package's section, and
+pass it to `CGP(policy, env)`, with the policy and the `replay_buffer_class` that the table names. For an environment that is
+not in the table, see [your own environment](environments.md).
 """
 NOTES = """\
-- **trains**: 220 steps by CGP's defaults (networks of 256 and 256 units, batches of 128) but for 110 random steps and a
-  small replay buffer. The model then predicts actions within the bounds, is saved, and acts the same when it is loaded.
-- **resumes**: the same training once without a stop, and once stopped after step 163 and resumed by another process. "To the
-  bit": both end with the same networks, optimizers, replay buffer and counters. "From a new episode": the environment's state
-  cannot be restored; a warning says so, and the resumed training begins a new episode. "Differs": they differ, and
-  no warning says so.
-- **exports**: `model.export`. The number is the largest difference between the actions of `predict` and those of `policy.onnx`
-  in onnxruntime or of `load_weights`, in units of the width of the action space.
-- **steps/s**: environment steps per second of processor time, with one thread and one gradient step a step; in brackets those
-  of the environment alone, with random actions. Both are too low where the load average, which each section gives, exceeds
-  the number of cores.
-- **learns**: the mean return of 20 episodes by random actions, and by the actor after a training of so many steps, whose
-  arguments are in `benchmark/compatibility/packages.py`; and how many of these episodes ended in success, where the
-  environment reports it.
-- "–" stands for what was not checked, or was interrupted.
+- **trains**: CGP was trained for 220 steps, 110 of them random, with its default networks and batch size and a small replay
+  buffer. The model then predicted actions within the bounds, was saved, and predicted the same when it was loaded.
+- **resumes**: a training that was stopped after step 163, and resumed by another process, was compared with one that was not
+  stopped. "bit for bit": both end with identical networks, optimizers, replay buffer and counters. "from a new episode": the
+  environment's state cannot be restored, so that the resumed training begins a new episode, and a warning says so.
+  "differs": the trainings differ without a warning. `replayed` restores an environment by [repeating the interrupted
+  episode](environments.md#simulators-whose-state-cannot-be-read); without it, the training is resumed from a new episode.
+- **exports**: `model.export` worked. In brackets: the largest difference between the actions of `predict` and those of the
+  exported policy, as a share of the action space's width.
+- **steps/s**: environment steps per second of processor time, on one thread, with one gradient step per step. In brackets:
+  the environment alone, with random actions. Where the load average of a section exceeds the number of cores, both are too
+  low.
+- **learns**: the mean return of 20 episodes, first by random actions, then by the actor after a training of that many steps;
+  and how many of the episodes were successful, where the environment reports it. The arguments are in
+  `benchmark/compatibility/packages.py`.
+- "–": not checked, or the check was interrupted.
+
+`make test-environments` installs each package into a virtual environment of its own, repeats the checks, and writes the
+records and this page to `results/environments/environments.md`.
 """
 UNKNOWN = "–"
 
@@ -112,6 +115,7 @@ def _learns(environment: Environment, found: dict[str, Any]) -> str:
 def _section(package: Package, record: dict[str, Any]) -> str:
     """Return the section of a package."""
     lines = [f"## {package.name}", "", f"`pip install {' '.join(map(_quoted, package.requirements))}`", ""]
+    lines += ["```py", _code(package), "```", ""]
     installation = record["installation"]
     if "failure" in installation:
         lines.append(f"- It was not installed: {installation['failure']}")
@@ -120,12 +124,24 @@ def _section(package: Package, record: dict[str, Any]) -> str:
         lines.append(f"- Tested: {versions}, with Python {record['python']}. {_pins(record)}")
     lines += [f"- {note}" for note in package.notes]
     for environment in package.environments:
-        found = record["environments"].get(environment.id, {})
-        facts = [*environment.notes, *_facts(found)]
-        lines += ["", f"{environment.id}:", "", "```py", environment.code, "```"]
-        lines += ["", *(f"- {fact}" for fact in facts)] if facts else []
+        facts = [*environment.notes, *_facts(record["environments"].get(environment.id, {}))]
+        if len(package.environments) > 1 and facts:
+            facts = [f"**{environment.id}**: {' '.join(facts)}"]
+        lines += [f"- {fact}" for fact in facts]
     lines += ["", _conditions(record)]
     return "\n".join(lines) + "\n"
+
+
+def _code(package: Package) -> str:
+    """Return the code that makes the package's environments: if each takes one line, all imports, and then these lines."""
+    parts = [environment.code.rpartition("\n\n") for environment in package.environments]
+    if len(parts) == 1 or any("\n" in last for _, _, last in parts):
+        return "\n\n\n".join(environment.code for environment in package.environments)
+    imports = dict.fromkeys(line for first, _, _ in parts for line in first.splitlines() if line)
+    # As isort has them: the project's own imports are a block of their own
+    own = [line for line in imports if line.startswith("from sb3_cgp")]
+    others = sorted((line for line in imports if line not in own), key=lambda line: (line.startswith("from"), line))
+    return "\n".join([*others, *([""] if own else []), *own, "", *(last for _, _, last in parts)])
 
 
 def _conditions(record: dict[str, Any]) -> str:

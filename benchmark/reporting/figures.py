@@ -32,7 +32,7 @@ CURVES = (
     "Until an offline variant's policy is trained, at the end, its curve is CEM's. The vertical axis is that of the "
     "evaluations after the random steps at the start; untrained policies may be below it."
 )
-LITERATURE = " Hollow markers are mean returns from the literature, on other versions of the environment (table below)."
+LITERATURE = " Open markers are mean returns from the literature, on other versions of the environment (table below)."
 MINUTES = (
     "The same on {} by minutes of processor time, of all threads, evaluations included. A run's evaluation is placed at the "
     "run's time times the evaluation's step divided by the run's steps, and a method's curve at the mean over its runs."

@@ -18,7 +18,7 @@ hyperparameters             numbers become tensors by agent; arguments that chan
 
 An agent pauses in a step where it is not due: before its ``learning_starts``, between its ``policy_delay`` and its
 ``target_update_interval``, and for ever after a loss that is NaN or infinite. Its parameters and its optimizer's state stay as
-they are to the bit, and the other agents do not notice.
+they are, bit for bit, and the other agents are not affected.
 
 Agent i begins with the networks and the environment that a CGP alone has with its seed. Given the same minibatches and random
 numbers, it computes what that CGP computes. In a population, all agents draw from one generator.
