@@ -1,6 +1,5 @@
 """The hyperparameters of a training in TensorBoard's tab HParams, for any algorithm of SB3."""
 
-import inspect
 from collections.abc import Sequence
 from numbers import Real
 from typing import Any
@@ -10,6 +9,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import HParam, TensorBoardOutputFormat
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+
+from sb3_cgp.common.sb3_arguments import constructor_argument_names
 
 # Arguments of a constructor that are no hyperparameters
 _LEFT_OUT = {"self", "env", "stats_window_size", "tensorboard_log", "verbose", "_init_setup_model"}
@@ -45,17 +46,7 @@ def _argument_names(algorithm: type[BaseAlgorithm]) -> set[str]:
     declared = getattr(algorithm, "hyperparameter_names", None)
     if declared is not None:
         return set(declared)
-    names: set[str] = set()
-    # In the order in which `super().__init__` goes through the constructors
-    for base in algorithm.__mro__:
-        if "__init__" not in vars(base):
-            continue
-        parameters = inspect.signature(vars(base)["__init__"]).parameters.values()
-        own = {each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
-        names |= own
-        if len(own) == len(parameters):
-            break
-    return names
+    return constructor_argument_names(algorithm)
 
 
 def _shown(value: Any) -> str | float:
