@@ -212,6 +212,7 @@ def test_a_misspelt_policy_is_refused_with_the_nearest_name(algorithm):
         algorithm("zzz", "Pendulum-v1")
 
 
-def test_a_policy_that_is_no_class_is_refused():
-    with pytest.raises(ValueError, match=r"`policy` is 5, but must be a subclass of sb3_cgp\.CGPPolicy, or the name of one"):
-        CGP(5, "Pendulum-v1")
+@pytest.mark.parametrize("algorithm", [CGP, GuardedTD3])
+def test_a_policy_that_is_no_class_is_refused(algorithm):
+    with pytest.raises(ValueError, match="`policy` is 5, but must be a class of policies, or one of 'MlpPolicy', 'CnnPolicy'"):
+        algorithm(5, "Pendulum-v1")

@@ -36,6 +36,11 @@ class ArgumentGuard(OffPolicyAlgorithm):
             )
         return super()._get_policy_from_name(policy_name)
 
+    def _setup_model(self) -> None:
+        allowed = f"a class of policies, or one of {', '.join(map(repr, self.policy_aliases))}"
+        require(isinstance(self.policy_class, type), "policy", self.policy_class, allowed)
+        super()._setup_model()
+
     def learn(
         self: SelfArgumentGuard, total_timesteps: int, callback: Any = None, log_interval: Any = 4, *args: Any, **kwargs: Any
     ) -> SelfArgumentGuard:
