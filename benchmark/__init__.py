@@ -1,8 +1,7 @@
 """Training runs, turned into figures and records: development tools, not part of the installed package."""
 
+import importlib.util
 import sys
-
-from sb3_cgp.common.extras import require_from_extra
 
 # Commands that do without the extra, on a machine that is lent for a short time
 BARE = ("benchmark.gpu_list", "benchmark.population")
@@ -10,5 +9,13 @@ BARE = ("benchmark.gpu_list", "benchmark.population")
 # `python -m` imports the package before it knows the command
 if not any(option == "-m" and module in BARE for option, module in zip(sys.orig_argv, sys.orig_argv[1:], strict=False)):
     # Not all of the others come with rl_zoo3 where that was installed without the extra
-    for name in ("rl_zoo3", "matplotlib", "pandas", "rliable", "scipy", "tensorboard"):
-        require_from_extra(name, "zoo", "The package benchmark")
+    missing = [
+        name
+        for name in ("rl_zoo3", "matplotlib", "pandas", "rliable", "scipy", "tensorboard")
+        if importlib.util.find_spec(name) is None
+    ]
+    if missing:
+        # PyTorch, which the package imports, takes seconds
+        from sb3_cgp.common.extras import require_from_extra
+
+        require_from_extra(missing[0], "zoo", "The package benchmark")

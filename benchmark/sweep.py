@@ -10,6 +10,12 @@ import signal
 import sys
 from collections.abc import Sequence
 
+from benchmark.common.sweep_names import refuse_unknown_sweep
+
+if __name__ == "__main__":
+    # At once: the imports below take seconds
+    refuse_unknown_sweep(sys.argv[1:])
+
 from benchmark.common.arguments import add_epilog, count, hyperparameter, output_folder
 from benchmark.reporting.figures import FOLDER, figures, study_folders
 from benchmark.sweeps.checks import check_values
@@ -118,6 +124,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         studies = [study_name(sweep.name, args.study, args.task and sweep.file.tasks) for sweep in sweeps]
         storage = open_storage(args.storage)
         for sweep in sweeps:
+            print(f"Checking the hyperparameters of {sweep.name}", file=sys.stderr, flush=True)
             check_values(sweep)
         folders = [execute(sweep, storage, study, args, argv) for sweep, study in zip(sweeps, studies, strict=True)]
     except ValueError as error:

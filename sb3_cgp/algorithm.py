@@ -21,6 +21,7 @@ from sb3_cgp.fast.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_cgp.fast.replay import LeanReplayAlgorithm
 from sb3_cgp.fast.scoring import SCORING_DTYPES
 from sb3_cgp.guards.algorithm import GuardedAlgorithm
+from sb3_cgp.guards.arguments import check_callback
 from sb3_cgp.guards.losses import LossGuard
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
 from sb3_cgp.selectors.algorithm import SelectorAlgorithm
@@ -240,6 +241,7 @@ class CGP(
         """
         allowed = "None: call `learn`, which resumes the interrupted training, before `train_policy`"
         require(self.resumption is None, "resumption", "a loaded state", allowed)
+        check_callback("callback", callback)
         with self.as_training(), self._explaining_errors():
             self._check_normalisation()
             self._fit_replay_buffer()
@@ -272,6 +274,8 @@ class CGP(
         :param kwargs: arguments to change in the model when loading, such as ``cem_iterations=4``
         :return: new model instance with loaded parameters
         :raises ValueError: if a changed argument is out of its range or contradicts another one
+        :raises TypeError: if a changed argument is none of the constructor and no attribute of the model, naming it and the
+            nearest one that is allowed
         """
         if custom_objects is not None and "learning_rate" in custom_objects:
             custom_objects = {"actor_learning_rate": None} | custom_objects

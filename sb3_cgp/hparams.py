@@ -1,6 +1,5 @@
 """The hyperparameters of a training in TensorBoard's tab HParams, for any algorithm of SB3."""
 
-import inspect
 from collections.abc import Sequence
 from numbers import Real
 from typing import Any
@@ -9,7 +8,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import HParam, TensorBoardOutputFormat
 from stable_baselines3.common.type_aliases import TrainFreq
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+
+from sb3_cgp.common.sb3_arguments import constructor_argument_names
 
 # Arguments of a constructor that are no hyperparameters
 _LEFT_OUT = {"self", "env", "stats_window_size", "tensorboard_log", "verbose", "_init_setup_model"}
@@ -21,7 +22,7 @@ def hyperparameters(model: BaseAlgorithm) -> dict[str, str | float]:
 
     :param model: the model
     :return: the arguments of the model's constructor by name, the algorithm's name and the number of environments. Numbers
-        stay numbers, and a schedule is its initial value. All else is text.
+        stay numbers. All else is text; that of a schedule has its values at the start and at the end of the training.
     """
     # An argument that the algorithm does not keep as an attribute cannot be read
     names = _argument_names(type(model)) - _LEFT_OUT
@@ -45,17 +46,7 @@ def _argument_names(algorithm: type[BaseAlgorithm]) -> set[str]:
     declared = getattr(algorithm, "hyperparameter_names", None)
     if declared is not None:
         return set(declared)
-    names: set[str] = set()
-    # In the order in which `super().__init__` goes through the constructors
-    for base in algorithm.__mro__:
-        if "__init__" not in vars(base):
-            continue
-        parameters = inspect.signature(vars(base)["__init__"]).parameters.values()
-        own = {each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
-        names |= own
-        if len(own) == len(parameters):
-            break
-    return names
+    return constructor_argument_names(algorithm)
 
 
 def _shown(value: Any) -> str | float:
@@ -63,8 +54,8 @@ def _shown(value: Any) -> str | float:
     Convert a value to a number or text.
 
     :param value: a hyperparameter
-    :return: a number; the initial value of a schedule, a function of the progress remaining; the name of a class;
-        text for all else. TensorBoard would show True as 1, and would omit None.
+    :return: a number, also for a schedule that SB3 made of one; text for another schedule, a function of the progress
+        remaining; the name of a class; text for all else. TensorBoard would show True as 1, and would omit None.
     """
     if isinstance(value, dict):
         return ", ".join(f"{name}={_shown(each)}" for name, each in sorted(value.items()))
@@ -74,7 +65,8 @@ def _shown(value: Any) -> str | float:
         return value.__name__
     # Not any function: SB3's action noise can be called, too
     if isinstance(value, FloatSchedule | LinearSchedule):
-        return float(value(1.0))
+        is_constant = isinstance(getattr(value, "value_schedule", value), ConstantSchedule)
+        return float(value(1.0)) if is_constant else f"schedule from {value(1.0):g} to {value(0.0):g}"
     if isinstance(value, Real) and not isinstance(value, bool):
         return float(value)
     text = str(value)

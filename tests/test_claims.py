@@ -7,9 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from finished_studies import record, runs, write_study
+from tables import unpadded
 
 from benchmark.common.records import Record
 from benchmark.reporting.claims import findings
+from benchmark.reporting.figures import figures
 from benchmark.reporting.scores import read_study, score_table
 from benchmark.reporting.verdicts import CONTRADICTED, NO_DATA, NOT_DECIDED, SUPPORTED, Finding
 
@@ -227,3 +229,29 @@ def test_few_seeds_decide_nothing(find: Any, seeds: int) -> None:
     found = find("imitates", records)
     assert found.verdict == NOT_DECIDED
     assert ("no interval" in found.text) == (seeds == 1)
+
+
+def test_the_page_of_a_users_own_sweep_has_no_claims_without_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The record of ``benchmark.runtime``, which is this repository's, is no data of the user's."""
+    mine = write_study(tmp_path / "mine", runs(scores(PPO=50, A2C=40), ["PPO", "A2C"]))
+    text = figures([mine], tmp_path, 10).read_text()
+    assert f"Drawing the figures of mine into {tmp_path}/figures" in capsys.readouterr().err
+    own = text[text.index("## The paper's claims") : text.index("## How to read this page")].splitlines()
+    sentence = "None of the paper's experiments is on this page, and its runs have no data on the paper's claims."
+    assert own == ["## The paper's claims", "", sentence, ""]
+    assert "Figure numbers in headings are the paper's" not in text
+    assert "benchmark.runtime" not in text
+
+
+def test_the_page_of_a_users_own_sweep_has_the_claims_on_which_it_has_data(tmp_path: Path) -> None:
+    levels = scores(CGP_Online=50, CEM=20)
+    mine = write_study(tmp_path / "mine", runs(levels, ["CGP-Online", "CEM"]))
+    text = unpadded(figures([mine], tmp_path, 10).read_text())
+    assert "None of the paper's experiments is on this page. The table lists the claims on which these runs" in text
+    assert "| the actor is at least as good as the CEM policy that it imitates |" in text
+    assert NO_DATA not in text
+    papers = write_study(tmp_path / "e1", runs(levels, ["CGP-Online", "CEM"]))
+    text = figures([mine, papers], tmp_path, 10).read_text()
+    assert "None of the paper's experiments is on this page" not in text
+    assert NO_DATA in text
+    assert "Figure numbers in headings are the paper's" in text

@@ -2,6 +2,8 @@
 
 import itertools
 import re
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -9,8 +11,10 @@ import pytest
 import yaml
 
 from benchmark.sweeps.experiments import included_sweeps, load_sweep, sweeps_folder
+from benchmark.sweeps.processes import start_workers
 from benchmark.sweeps.validation import SweepError
 
+ROOT = Path(__file__).parent.parent
 GOOD = dict(title="A sweep", methods=["TD3", "CGP-Online"], tasks=["Pendulum-v1"], steps=100, seeds=2, evaluation_interval=10)
 PAPER = ["e1", "e3", "e4", "e5", "e6", "e7", "e8"]
 
@@ -226,6 +230,24 @@ def test_text_that_looks_like_a_number_is_left_to_other_code(sweep_of):
 def test_no_sweep_of_that_name():
     with pytest.raises(SweepError, match="must be one of e1, e2"):
         load_sweep("e9")
+
+
+@pytest.mark.parametrize("name", ["e9", "e33", "methods", "mine.yml"])
+def test_a_misspelt_sweep_is_refused_before_anything_slow_is_imported(name):
+    command = [sys.executable, "-X", "importtime", "-m", "benchmark.sweep", name, "--steps", "100"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert found.returncode == 1
+    assert f"Error: {name}: no such sweep: must be one of e1, e2, e3, e4, e5, e6, e7, e8, e10, " in found.stderr
+    assert "import time:" in found.stderr
+    assert all(slow not in found.stderr for slow in ("torch", "stable_baselines3", "optuna", "matplotlib"))
+
+
+def test_processes_that_start_are_announced_with_their_logs(tmp_path, capsys):
+    for worker in start_workers([sys.executable, "-c", ""], 2, 1, tmp_path):
+        assert worker.wait() == 0
+    assert capsys.readouterr().err == f"Starting 2 workers, whose logs are {tmp_path}/worker-*.log\n"
+    start_workers([sys.executable, "-c", ""], 0, 1, tmp_path)
+    assert capsys.readouterr().err == ""
 
 
 def test_what_the_command_line_changes_is_checked_too():

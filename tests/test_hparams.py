@@ -10,6 +10,7 @@ from stable_baselines3 import DDPG, PPO, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
 from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
 from tensorboard.context import RequestContext
@@ -98,8 +99,8 @@ def test_every_argument_of_cgp_has_a_column_in_each_of_several_runs(tmp_path):
     arguments = CGP.__init__.__code__.co_varnames[1 : CGP.__init__.__code__.co_argcount]
     assert set(arguments) - left_out <= columns
     assert first["policy_loss"] == "None"
-    # In columns of numbers
-    assert (first["learning_rate"], first["actor_learning_rate"]) == (1e-2, 1e-2)
+    assert (first["learning_rate"], first["actor_learning_rate"]) == ("schedule from 0.01 to 0",) * 2
+    # Numbers, although SB3 makes schedules of them
     assert (second["learning_rate"], second["actor_learning_rate"]) == (1e-3, 1e-4)
     assert (second["inference"], second["action_noise"]) == ("cem", "NormalActionNoise(mu=[0.], sigma=[0.1])")
     # Not the address of an object, which would be another one in each run
@@ -118,6 +119,27 @@ def test_on_policy_algorithms(tmp_path):
     model.learn(8, HParamsCallback())
     (row,) = Tab(tmp_path).rows()
     assert (row["algorithm"], row["n_steps"], row["clip_range"], row["learning_rate"]) == ("PPO", 8, 0.2, 3e-4)
+
+
+@pytest.mark.parametrize(
+    ("given", "shown"),
+    [
+        (1e-3, 1e-3),
+        (FloatSchedule(1e-3), 1e-3),
+        (ConstantSchedule(1e-3), 1e-3),
+        (LinearSchedule(1e-3, 1e-4, 0.5), "schedule from 0.001 to 0.0001"),
+        (lambda progress_remaining: 1e-3 * progress_remaining, "schedule from 0.001 to 0"),
+        # Rises and falls
+        (lambda progress_remaining: 1e-3 - abs(progress_remaining - 0.5) * 1e-3, "schedule from 0.0005 to 0.0005"),
+    ],
+)
+def test_a_schedule_is_told_from_a_number(given, shown):
+    for algorithm in (CGP, TD3, SAC):
+        assert hyperparameters(algorithm("MlpPolicy", "Pendulum-v1", given, **tiny()))["learning_rate"] == shown
+    model = CGP("MlpPolicy", "Pendulum-v1", 1e-2, actor_learning_rate=given, **tiny())
+    assert [hyperparameters(model)[name] for name in ("learning_rate", "actor_learning_rate")] == [1e-2, shown]
+    clipped = PPO("MlpPolicy", "Pendulum-v1", clip_range=given, n_steps=8, batch_size=8, device="cpu")
+    assert hyperparameters(clipped)["clip_range"] == shown
 
 
 class PassingAll(CGP):

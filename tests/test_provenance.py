@@ -34,3 +34,11 @@ def test_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None
 def test_a_machine_says_what_cem_computes_in(monkeypatch: pytest.MonkeyPatch, has_bfloat16: bool) -> None:
     monkeypatch.setattr(th.cpu, "get_capabilities", lambda: {"avx512_bf16": has_bfloat16}, raising=False)
     assert provenance.machine(th.device("cpu"))["cem_dtype"] == ("bfloat16" if has_bfloat16 else "float32")
+
+
+@pytest.mark.parametrize(("load", "words"), [(4.51708984375, ", load average before the start 4.5."), (None, "")])
+def test_a_load_average_is_rounded_and_left_out_where_there_is_none(load: float | None, words: str) -> None:
+    record = {**provenance.conditions("benchmark.sweep", ["e3"], th.device("cpu")), "load_average": load}
+    text = provenance.conditions_in_words(record)
+    assert f"commit {record['commit']}{words or '.'}\n\n" in text
+    assert ("load average" in text) == bool(words)

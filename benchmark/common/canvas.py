@@ -22,6 +22,8 @@ LOOK: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
+# How often a figure is enlarged at most, the inches that letters may be beyond its edge, and those between two titles
+ENLARGEMENTS, SLACK, TITLE_GAP = 4, 0.03, 0.1
 # Markers on a line, so that it is told from others without its colour
 MARKS = 6
 SEED: dict[str, Any] = dict(linewidth=0.8, alpha=0.35)
@@ -48,14 +50,35 @@ def styled(draw: Drawn) -> Drawn:
 
 def png(figure: Figure) -> bytes:
     """
-    Save a figure.
+    Save a figure. A figure that cuts letters off is enlarged before.
 
     :param figure: the figure
     :return: the picture, the same for the same figure, in the colours that it was drawn in
     """
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=120, pil_kwargs={"optimize": True})
+    for _ in range(ENLARGEMENTS):
+        picture = io.BytesIO()
+        figure.savefig(picture, format="png", dpi=120, pil_kwargs={"optimize": True})
+        # Measured after the layout, which a draw before would change
+        missing = _missing_inches(figure)
+        if missing.max() < SLACK:
+            break
+        figure.set_size_inches(figure.get_size_inches() + missing)
     return picture.getvalue()
+
+
+def _missing_inches(figure: Figure) -> np.ndarray:
+    """Return the width and height that a drawn figure lacks for all letters, those of titles beside each other included."""
+    size, drawn = figure.get_size_inches(), figure.get_tightbbox()
+    # Centred letters are cut at both ends
+    beyond = [max(-drawn.x0, drawn.x1 - size[0]), max(-drawn.y0, drawn.y1 - size[1])]
+    cut = 2 * np.maximum(0.0, beyond)
+    for axes in figure.axes:
+        place = axes.get_subplotspec()
+        if place is not None:
+            columns = place.get_gridspec().ncols
+            title = axes.title.get_window_extent().width / figure.dpi
+            cut[0] = max(cut[0], columns * (title + TITLE_GAP) - size[0] if columns > 1 else 0.0)
+    return cut
 
 
 def panels(

@@ -125,8 +125,10 @@ def conditions_in_words(record: dict[str, Any]) -> str:
     place = hardware["gpu"] or hardware["device"]
     threads = f"{hardware['torch_threads']} thread" + "s" * (hardware["torch_threads"] > 1)
     versions = ", ".join(f"{package} {version}" for package, version in record["versions"].items() if version is not None)
+    before = record["load_average"]
+    load = "" if before is None else f", load average before the start {before:.1f}"
     return (
         f"`{record['command']}` on {hardware['cpu']} ({hardware['cpu_capability']}, {hardware['cores']} cores), "
-        f"{threads}, networks on {place}, CEM by default in {hardware['cem_dtype']}, commit {record['commit']}, "
-        f"load average before the start {record['load_average']}.\n\n{versions}."
+        f"{threads}, networks on {place}, CEM by default in {hardware['cem_dtype']}, commit {record['commit']}"
+        f"{load}.\n\n{versions}."
     )

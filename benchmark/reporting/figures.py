@@ -3,6 +3,7 @@
 import itertools
 import json
 import re
+import sys
 import zlib
 from collections import Counter
 from collections.abc import Sequence
@@ -70,6 +71,7 @@ def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPE
     names = [study.name for study in studies]
     if len(set(names)) < len(names):
         raise ValueError(f"Two of these studies have the same name: {', '.join(names)}")
+    print(f"Drawing the figures of {', '.join(names)} into {out / FIGURES}", file=sys.stderr, flush=True)
     in_earnest = longest(studies)
     together = stability_together(in_earnest, repetitions)
     pictures = [draw(study, repetitions) for study in studies]
@@ -100,7 +102,10 @@ def page_of(
     :return: the page, in Markdown
     """
     papers = [study for study in in_earnest if experiment_number(study) not in NOT_THE_PAPERS]
-    claims = claims_section(findings(score_table(papers), read_runtime(out), repetitions))
+    of_the_user = all(experiment_number(study) is None for study in studies)
+    runtime = None if of_the_user else read_runtime(out)
+    judged = findings(score_table(papers), runtime, repetitions)
+    claims = claims_section(judged, of_the_user)
     folders = [study.folder for study in studies]
     command = command_line([] if folders == study_folders(out) else folders, out, repetitions)
     found = [
@@ -117,9 +122,9 @@ def page_of(
     if any(is_papers(study) for study in studies):
         sections = [introduction(studies), claims, *found, *pooled, *results]
     else:
-        # The user's findings come first, and the paper's claims last
+        # The findings on these studies come first, and the paper's claims last
         sections = [introduction(studies), *found, *results, claims, *pooled]
-    return page(list(filter(None, sections)), command)
+    return page(list(filter(None, sections)), command, not of_the_user or any(finding.parts for finding in judged))
 
 
 def is_papers(study: Study) -> bool:

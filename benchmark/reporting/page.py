@@ -29,9 +29,8 @@ Numbers that seem to contradict each other:
   number of random steps at the start and the networks differ. Each study's section lists its own.
 
 The intervals do not contain the variance of the mean over other episodes, so small differences may be due to these episodes.
-The figures and tables of a study use its own runs; the claims and the figure of all sweeps together use the runs of all
-studies here. {LENGTH_RULE}
-The time of inference was measured separately, by `python -m benchmark.runtime`. Figure numbers in headings are the paper's.
+The figures and tables of a study use its own runs; the figure of all sweeps together{{claims}} the runs of all studies
+here. {LENGTH_RULE}{{papers}}
 
 Intervals are 95 % percentile bootstrap intervals by rliable; runs are drawn within each task and configuration. Few runs make
 them too narrow: on normally distributed rewards, the interval of an interquartile mean of 2, 3, 4, 5, 10 runs contains the
@@ -42,6 +41,20 @@ true value in 52, 72, 88, 89, 93 % of the cases. There is no interval where a co
 SHARES = (
     "Rewards in this table are shares of their task's range, from 0 for the lowest return of any evaluation to 1 for the best "
     "final reward."
+)
+
+# What the page adds where it judges the paper's claims
+WITH_CLAIMS = {
+    "claims": " and the claims use",
+    "papers": "\nThe time of inference was measured separately, by `python -m benchmark.runtime`. "
+    "Figure numbers in headings are the paper's.",
+}
+WITHOUT_CLAIMS = {"claims": " uses", "papers": ""}
+CLAIMS = "## The paper's claims"
+NO_DATA_OF_THE_USER = "None of the paper's experiments is on this page, and its runs have no data on the paper's claims."
+OF_THE_USER = (
+    "None of the paper's experiments is on this page. The table lists the claims on which these runs, which were not made for "
+    "them, have data."
 )
 
 
@@ -61,13 +74,18 @@ def introduction(studies: Sequence[Study]) -> str:
     return text
 
 
-def claims_section(findings: Sequence[Finding]) -> str:
+def claims_section(findings: Sequence[Finding], of_the_user: bool = False) -> str:
     """
     Report on the paper's claims.
 
     :param findings: the findings on the claims
+    :param of_the_user: whether none of this project's experiments is on the page. Claims without data are then left out.
     :return: the section, in Markdown
     """
+    if of_the_user:
+        findings = [finding for finding in findings if finding.parts]
+        if not findings:
+            return f"{CLAIMS}\n\n{NO_DATA_OF_THE_USER}"
     rows = [[finding.claim, finding.evidence or "-", f"**{finding.verdict}**"] for finding in findings]
     table = markdown_table(["claim", "evidence (95 % interval)", "verdict"], rows, align="left")
     several = [finding for finding in findings if len(finding.parts) > 1 or any(part.note for part in finding.parts)]
@@ -76,7 +94,7 @@ def claims_section(findings: Sequence[Finding]) -> str:
         for finding in several
     ]
     folds = [fold("All comparisons", *parts)] * bool(parts) + [fold("How claims are judged", RULES)]
-    return "\n\n".join(["## The paper's claims", table, SHARES, *folds])
+    return "\n\n".join([CLAIMS, *[OF_THE_USER] * of_the_user, table, SHARES, *folds])
 
 
 def pooled_section(picture: Picture, command: str) -> str:
@@ -90,12 +108,14 @@ def pooled_section(picture: Picture, command: str) -> str:
     return f"## All sweeps together\n\n{picture.in_words()}\n\n{fold('Command', f'`{command}`')}"
 
 
-def page(sections: Sequence[str], command: str) -> str:
+def page(sections: Sequence[str], command: str, with_claims: bool = True) -> str:
     """
     Return the page.
 
     :param sections: its sections
     :param command: the command that writes it
+    :param with_claims: whether one of the sections has data on the paper's claims
     :return: the page, in Markdown
     """
-    return "\n\n".join([TITLE, *sections, READING, fold("The command that writes this page", f"`{command}`")]) + "\n"
+    reading = READING.format(**(WITH_CLAIMS if with_claims else WITHOUT_CLAIMS))
+    return "\n\n".join([TITLE, *sections, reading, fold("The command that writes this page", f"`{command}`")]) + "\n"

@@ -6,7 +6,6 @@ A file's keys are the fields of :class:`~benchmark.sweeps.sweep_files.SweepFile`
 
 import functools
 import itertools
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,14 +13,12 @@ from typing import Any
 
 from huggingface_sb3 import EnvironmentName
 
+from benchmark.common.sweep_names import METHODS_FILE, problem_of, sweep_names, sweep_path, sweeps_folder
 from benchmark.common.zoo import read_entry, shortened_warm_up
 from benchmark.sweeps.hyperparameters import problems
 from benchmark.sweeps.runs import Run, checkpoint_interval
 from benchmark.sweeps.sweep_files import Hyperparams, Inclusion, Method, Packages, SweepFile
 from benchmark.sweeps.validation import SweepError, read_yaml, validated
-from sb3_cgp.zoo.registration import hyperparams_folder
-
-METHODS_FILE = "methods.yml"
 
 
 @dataclass(frozen=True)
@@ -107,15 +104,6 @@ def tuned_entry(algo: str, task: str) -> Hyperparams:
         return {}
 
 
-def sweeps_folder() -> Path:
-    """
-    Return the folder of the paper's sweeps.
-
-    :return: the folder
-    """
-    return hyperparams_folder() / "sweeps"
-
-
 def find_sweep_file(name: str) -> Path:
     """
     Return a sweep's file.
@@ -124,16 +112,10 @@ def find_sweep_file(name: str) -> Path:
     :return: the file
     :raises SweepError: if there is none
     """
-    path = Path(name) if name.endswith((".yml", ".yaml")) else sweeps_folder() / f"{name}.yml"
-    if not path.is_file() or path.name == METHODS_FILE:
-        known = sorted((each.stem for each in sweeps_folder().glob("*.yml") if each.name != METHODS_FILE), key=_with_numbers)
-        raise SweepError(name, "", f"no such sweep: must be one of {', '.join(known)}, or the path of a .yml file")
-    return path
-
-
-def _with_numbers(name: str) -> list[str | int]:
-    """Return a key by which e2 comes before e10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
+    problem = problem_of(name)
+    if problem is not None:
+        raise SweepError(name, "", problem)
+    return sweep_path(name)
 
 
 def experiments_in_words() -> str:
@@ -143,13 +125,8 @@ def experiments_in_words() -> str:
     :return: name and title of each, a line each
     """
 
-    def order(path: Path) -> tuple[int, str]:
-        number = re.match(r"e(\d+)", path.stem)
-        return (int(number[1]) if number else 1_000, path.stem)
-
-    paths = sorted((path for path in sweeps_folder().glob("*.yml") if path.name != METHODS_FILE), key=order)
     lines = []
-    for path in paths:
+    for path in map(sweep_path, sweep_names()):
         content = read_yaml(path)
         parts = f" = {', '.join(content['includes'])}" if "includes" in content else f", {content['steps']:,} steps"
         lines.append(f"  {path.stem:<14} {content['title']}{parts}")

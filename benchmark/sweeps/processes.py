@@ -4,6 +4,7 @@ import argparse
 import os
 import signal
 import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
@@ -86,6 +87,9 @@ def start_workers(command: Sequence[str], n_workers: int, threads: int, folder: 
     :return: the processes
     """
     folder.mkdir(parents=True, exist_ok=True)
+    if n_workers > 0:
+        noun = "worker" if n_workers == 1 else "workers"
+        print(f"Starting {n_workers} {noun}, whose logs are {folder}/worker-*.log", file=sys.stderr, flush=True)
     # OpenMP reads this when it is loaded
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
     workers = []

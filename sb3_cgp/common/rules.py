@@ -1,5 +1,6 @@
 """Rules on arguments, and the errors for arguments that break them."""
 
+import difflib
 import math
 from collections.abc import Iterable
 from numbers import Integral, Real
@@ -18,6 +19,18 @@ def require(condition: bool, name: str, value: Any, allowed: str) -> None:
     """
     if not condition:
         raise ValueError(f"The value of `{name}` is {value!r}, but must be {allowed}.")
+
+
+def nearest(name: str, choices: Iterable[str], cutoff: float = 0.6) -> str | None:
+    """
+    Return the choice that is most similar to a misspelt name.
+
+    :param name: the misspelt name
+    :param choices: the names that are allowed
+    :param cutoff: the smallest similarity, within [0, 1]
+    :return: the most similar name; None if no name is similar
+    """
+    return next(iter(difflib.get_close_matches(name, sorted(choices), n=1, cutoff=cutoff)), None)
 
 
 def require_count(name: str, value: Any, minimum: int = 1) -> None:

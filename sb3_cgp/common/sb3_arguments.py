@@ -1,11 +1,13 @@
 """The rules on the arguments that SB3's off-policy algorithms have, and the forms of a learning rate."""
 
+import inspect
 import math
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
@@ -14,6 +16,26 @@ from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from sb3_cgp.common.rules import require, require_count, require_number
 
 LINEAR_SCHEDULE_PREFIX = "lin_"
+
+
+def constructor_argument_names(algorithm: type[BaseAlgorithm]) -> set[str]:
+    """
+    Return the names of the arguments that an algorithm's constructor takes, those that it passes on to its bases included.
+
+    :param algorithm: the algorithm's class
+    :return: the names
+    """
+    names: set[str] = set()
+    # In the order in which `super().__init__` goes through the constructors
+    for base in algorithm.__mro__:
+        if "__init__" not in vars(base):
+            continue
+        parameters = inspect.signature(vars(base)["__init__"]).parameters.values()
+        own = {each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+        names |= own
+        if len(own) == len(parameters):
+            break
+    return names
 
 
 def as_schedule(rate: float | Schedule | str) -> Schedule:

@@ -1,5 +1,6 @@
 """All guards in one class, to be mixed into an off-policy algorithm of SB3's."""
 
+from sb3_cgp.guards.arguments import ArgumentGuard
 from sb3_cgp.guards.dummy_vec_env import DummyVecEnvGuard
 from sb3_cgp.guards.episodes import EpisodeGuard
 from sb3_cgp.guards.explanations import ExplanationGuard
@@ -16,6 +17,7 @@ from sb3_cgp.guards.workers import WorkerGuard
 
 class GuardedAlgorithm(
     PathGuard,
+    ArgumentGuard,
     SeedGuard,
     WorkerGuard,
     ExplanationGuard,

@@ -11,7 +11,7 @@ from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNo
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_cgp.algorithm import CGP
-from sb3_cgp.common.rules import require, require_count
+from sb3_cgp.common.rules import nearest, require, require_count
 from sb3_cgp.core import policies as core_policies
 from sb3_cgp.fast import policies as fast_policies
 from sb3_cgp.selectors import policies as selector_policies
@@ -55,7 +55,9 @@ def merge_arguments(agents: int | Sequence[Arguments], common: Arguments) -> lis
     for index, own in enumerate(agents):
         require(isinstance(own, dict), f"agents[{index}]", own, "a dictionary of arguments of CGP")
     for name in {name for each in (common, *agents) for name in each}:
-        require(name in (*OWN, *COMMON), "arguments", name, f"one of {', '.join((*OWN, *COMMON))}")
+        similar = nearest(name, (*OWN, *COMMON))
+        advice = "" if similar is None else f"; the nearest name is `{similar}`"
+        require(name in (*OWN, *COMMON), "arguments", name, f"one of {', '.join((*OWN, *COMMON))}{advice}")
     seed = common.get("seed")
     seeds = [{} if seed is None else {"seed": seed + index} for index in range(len(agents))]
     merged = [common | seeds[index] | own for index, own in enumerate(agents)]

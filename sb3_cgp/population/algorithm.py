@@ -198,8 +198,9 @@ class Population(ResumableAlgorithm, PopulationMembers):
         :param kwargs: the same by keyword
         :return: the population
         :raises ValueError: if an argument of the agents is given, which a saved population has for each of them
+        :raises TypeError: if a population has no such argument or attribute, naming it and the nearest one that is allowed
         """
-        for name in {*OWN, *COMMON} & kwargs.keys():
+        for name in {"agents", *OWN, *COMMON} & kwargs.keys():
             require(name in ("verbose", "tensorboard_log"), name, kwargs[name], "left out: change it in a new population")
         return super().load(path, env, *args, **kwargs)
 

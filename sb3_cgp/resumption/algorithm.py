@@ -15,6 +15,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_cgp.common.files import whole_file
+from sb3_cgp.common.load_arguments import check_load_arguments
 from sb3_cgp.common.rules import require
 from sb3_cgp.resumption.callback_states import iter_callbacks
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
@@ -78,6 +79,7 @@ class ResumableAlgorithm(ResumableModel):
         :return: the model
         :raises FileNotFoundError: if the folder holds no state
         :raises ValueError: if all states are damaged, naming the files, or if the environment or an argument does not fit
+        :raises TypeError: if a model has no such argument or attribute, naming it and the nearest one that is allowed
         :raises FolderInUseError: if another training uses the folder, naming its host and process
         """
         store = StateStore(Path(path).resolve())
@@ -104,7 +106,9 @@ class ResumableAlgorithm(ResumableModel):
         digests = store.digests()
         _, state = store.load()
         require(state["algorithm"] == cls.__name__, "path", str(store.folder), f"of {cls.__name__}, not {state['algorithm']}")
-        model = cls.load(io.BytesIO(state.pop("model")), env, device, force_reset=False, **kwargs)
+        saved = io.BytesIO(state.pop("model"))
+        check_load_arguments(cls, saved, kwargs, "resume")
+        model = cls.load(saved, env, device, force_reset=False, **kwargs)
         assert model.env is not None
         check_fits(model, state)
         # Model and environment must share the space, as wrappers may draw random actions from it, too

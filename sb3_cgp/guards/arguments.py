@@ -1,0 +1,154 @@
+"""Arguments of a wrong type or name, which SB3 ignores or answers with an error far from its cause."""
+
+import io
+import math
+import pathlib
+import warnings
+from numbers import Real
+from typing import Any, TypeVar
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_cgp.common.load_arguments import check_load_arguments, misspelt_custom_objects
+from sb3_cgp.common.rules import nearest, require
+
+SelfArgumentGuard = TypeVar("SelfArgumentGuard", bound="ArgumentGuard")
+
+# The attributes in which SB3's CallbackList and EventCallback hold other callbacks
+SLOTS = ("callbacks", "callback", "callback_on_new_best")
+CALLBACK = "an instance of a subclass of BaseCallback"
+
+
+class ArgumentGuard(OffPolicyAlgorithm):
+    """An algorithm that refuses wrong arguments of ``learn`` and ``load``, and unknown policies, when it is called."""
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        known = ", ".join(map(repr, self.policy_aliases))
+        similar = nearest(policy_name, self.policy_aliases)
+        advice = "" if similar is None else f" Did you mean {similar!r}?"
+        if policy_name not in self.policy_aliases:
+            raise ValueError(
+                f"The value of `policy` is {policy_name!r}, but must be one of {known}, or a class of policies.{advice}"
+            )
+        return super()._get_policy_from_name(policy_name)
+
+    def _setup_model(self) -> None:
+        allowed = f"a class of policies, or one of {', '.join(map(repr, self.policy_aliases))}"
+        require(isinstance(self.policy_class, type), "policy", self.policy_class, allowed)
+        super()._setup_model()
+
+    def learn(
+        self: SelfArgumentGuard, total_timesteps: int, callback: Any = None, log_interval: Any = 4, *args: Any, **kwargs: Any
+    ) -> SelfArgumentGuard:
+        """
+        Learn, if the arguments are right.
+
+        :param total_timesteps: number of environment steps, an integer >= 0, or an equal float such as 1e5
+        :param callback: callback(s) called at every step with state of the algorithm.
+        :param log_interval: number of episodes between two writings of the log; None for no writing
+        :param args: the algorithm's own arguments
+        :param kwargs: the algorithm's own arguments
+        :return: the trained model
+        :raises ValueError: naming the first argument that is wrong, its value and what is allowed
+        """
+        total_timesteps = as_total_timesteps(total_timesteps)
+        check_callback("callback", callback)
+        allowed = "a number of episodes other than 0, or None to write no log"
+        is_interval = log_interval is None or (isinstance(log_interval, Real) and log_interval != 0)
+        require(is_interval, "log_interval", log_interval, allowed)
+        return super().learn(total_timesteps, callback, log_interval, *args, **kwargs)
+
+    @classmethod
+    def load(
+        cls: type[SelfArgumentGuard],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfArgumentGuard:
+        """
+        Load a model from a zip-file.
+
+        :param path: path to the file, or an open file
+        :param env: see SB3's method
+        :param device: see SB3's method
+        :param custom_objects: see SB3's method
+        :param print_system_info: see SB3's method
+        :param force_reset: see SB3's method
+        :param kwargs: arguments to change in the model
+        :return: the model
+        :raises TypeError: if a model has no such argument or attribute, naming it and the nearest one that is allowed
+        """
+        check_load_arguments(cls, path, kwargs)
+        if "policy" in kwargs:
+            message = (
+                f"`policy={kwargs.pop('policy')!r}` has no effect: a loaded model keeps the policy that it was saved with."
+            )
+            warnings.warn(message, stacklevel=2)
+        if "stats_window_size" in kwargs:
+            # SB3 keeps this argument under another name
+            kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
+        if custom_objects:
+            for name, similar in misspelt_custom_objects(path, custom_objects).items():
+                message = f"custom_objects[{name!r}] has no effect, as the saved model has no such attribute: {similar!r}?"
+                warnings.warn(message, stacklevel=2)
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+
+def as_total_timesteps(value: Any) -> int:
+    """
+    Return the number of environment steps of a training as an integer.
+
+    :param value: the argument of ``learn``
+    :return: the number
+    :raises ValueError: if the value is no integer >= 0, nor a float equal to one, which SB3 takes too
+    """
+    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    is_infinite = number == math.inf
+    remedy = ": for a training that a callback ends, give a large one such as 10**12" if is_infinite else ""
+    require(number >= 0 and number % 1 == 0, "total_timesteps", value, f"an integer >= 0{remedy}")
+    return int(value)
+
+
+def check_callback(name: str, value: Any) -> None:
+    """
+    Check the callback of a training, and the callbacks within SB3's own ones.
+
+    :param name: the argument's name
+    :param value: the callback, a list of them, a function of the local and global variables, or None
+    :raises ValueError: if one of them is a class, or nothing that can be called back
+    """
+    is_function = callable(value) and not isinstance(value, type)
+    if value is None or (is_function and not isinstance(value, BaseCallback)):
+        return
+    if not isinstance(value, list):
+        _check_instance(name, value, f"{CALLBACK}, a list of them, a function, or None")
+    _check_parts(name, value)
+
+
+def _check_parts(name: str, value: Any) -> None:
+    """Check the callbacks within a callback or a list."""
+    # Not any attribute: that of a user's own callback may hold a class for a purpose of its own
+    slots = SLOTS if isinstance(value, CallbackList | EventCallback) else ()
+    parts = {name: value} if isinstance(value, list) else {f"{name}.{slot}": vars(value).get(slot) for slot in slots}
+    for place, content in parts.items():
+        named = {f"{place}[{i}]": each for i, each in enumerate(content)} if isinstance(content, list) else {place: content}
+        for part_name, part in named.items():
+            if part is None and not isinstance(content, list):
+                continue
+            _check_instance(part_name, part, f"{CALLBACK}; `ConvertCallback(function)` makes one of a function")
+            _check_parts(part_name, part)
+
+
+def _check_instance(name: str, value: Any, allowed: str) -> None:
+    """Refuse anything but an instance of a callback."""
+    is_class = isinstance(value, type) and issubclass(value, BaseCallback)
+    remedy = f": write `{value.__name__}(...)`, with its arguments" if is_class else ""
+    require(isinstance(value, BaseCallback), name, value, f"{allowed}{remedy}")
