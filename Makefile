@@ -68,8 +68,14 @@ train: $(INSTALLED) ## install, train with rl_zoo3, evaluate and draw the learni
 	  if ls "$$run"/state/state-*.json > /dev/null 2>&1; then echo "or  make resume RUN=\"$$run\""; fi; exit 130; fi && \
 	$(IN_VENV) -m benchmark.report --algo $(ALGO) --env $(ENV) --folder "$(LOGS)" --exp-id $$2
 
+# Before the installation
+ifneq ($(filter resume,$(MAKECMDGOALS)),)
+ifeq ($(strip $(RUN)),)
+$(error Name the run's folder, as in: make resume RUN=logs/cgp/Pendulum-v1_1)
+endif
+endif
+
 resume: $(INSTALLED) ## continue an interrupted run of CGP to its end, and report: make resume RUN=logs/cgp/Pendulum-v1_1
-	@test -n "$(RUN)" || { echo "Name the run's folder, as in: make resume RUN=logs/cgp/Pendulum-v1_1" >&2; exit 1; }
 	$(IN_VENV) -m sb3_cgp.zoo.resume "$(RUN)"
 	$(IN_VENV) -m benchmark.report --run "$(RUN)"
 

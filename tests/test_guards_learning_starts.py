@@ -8,8 +8,11 @@ import pytest
 from guarded import SMALL, GuardedTD3, located
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_cgp.population import Population
 from sb3_cgp.resumption.algorithm import resumable
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
+
+POPULATION = dict(buffer_size=100, batch_size=4, policy_kwargs=dict(net_arch=[4]), device="cpu")
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
@@ -108,6 +111,33 @@ def test_the_share_of_random_steps_is_printed_with_verbose(verbose, learning_sta
     assert printed in found
     assert ("Actions are random" in found) == bool(printed)
     assert ("more than half" in found) == ("more than half" in printed)
+
+
+@pytest.mark.parametrize(
+    ("starts", "steps", "printed"),
+    [
+        ((10, 10), 60, "in the next 10 of 30 environment steps of each agent (learning_starts=10), without gradient steps."),
+        ((4, 12), 60, "in the next 4 to 12 of 30 environment steps of each agent (learning_starts=4 to 12), without"),
+        ((0, 40), 61, "in the next 0 to 31 of 31 environment steps of each agent (learning_starts=0 to 40), without"),
+        ((1000, 1000), 2200, "in the next 1,000 of 1,100 environment steps of each agent (learning_starts=1000), without"),
+        ((10,), 60, "in the next 10 of 60 environment steps (learning_starts=10), without gradient steps."),
+    ],
+)
+def test_a_population_counts_the_random_steps_of_an_agent(starts, steps, printed, capsys):
+    """As the argument does, and not those of all environments, which SB3 counts."""
+    agents = [dict(learning_starts=start) for start in starts]
+    population = Population("MlpPolicy", "Pendulum-v1", agents, **(POPULATION | dict(verbose=1)))
+    population._setup_learn(steps)
+    assert f"Actions are random {printed}" in capsys.readouterr().out
+
+
+def test_a_population_that_learns_nothing_is_warned_of_by_the_steps_of_an_agent():
+    population = Population("MlpPolicy", "Pendulum-v1", 4, **(POPULATION | dict(learning_starts=50)))
+    message = (
+        r"ends at environment step 20 of each agent, and gradient steps begin after step learning_starts=50\. .* such as 2\."
+    )
+    with pytest.warns(UserWarning, match=message):
+        population.learn(80)
 
 
 @pytest.mark.filterwarnings("error")

@@ -161,12 +161,18 @@ def test_resume_without_a_run_says_how_to_name_one(clone: Clone) -> None:
     calls, ended = clone.make("resume", RUN="/var/run")
     assert ended.returncode != 0
     assert "make resume RUN=logs/cgp/Pendulum-v1_1" in ended.stderr
+    # Before anything is installed, also beside another goal
+    assert calls == []
+    for goals in (["resume", "RUN="], ["resume", "RUN= "], ["train", "resume"], ["-j4", "resume"]):
+        calls, ended = clone.make(*goals)
+        assert (calls, ended.returncode) == ([], 2)
+    assert "make resume RUN=logs/cgp/Pendulum-v1_1" in ended.stderr
     assert not starting(calls, "-m sb3_cgp")
 
 
 def test_every_goal_installs_its_extra_once(clone: Clone) -> None:
     goals = ("train", "sweeps", "docs", "test", "train", "test-slow", "sweeps", "docs", "resume")
-    installed = [starting(clone.make(goal, RUN="logs/cgp/Ant-v5_2")[0], "-m pip") for goal in goals]
+    installed = [starting(clone.make(goal, "RUN=logs/cgp/Ant-v5_2")[0], "-m pip") for goal in goals]
     extras = [[call.partition("-e ")[2] for call in calls] for calls in installed]
     assert extras == [[".[zoo]"], [".[sweeps]"], [".[docs]"], [".[tests]"], [], [], [], [], []]
 

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from gymnasium.wrappers import TimeLimit
@@ -70,15 +71,25 @@ class LearningStartsGuard(OffPolicyAlgorithm):
         steps_per_rollout = self.train_freq.frequency * self.n_envs
         return self.num_timesteps + steps_per_rollout * math.ceil((total_timesteps - self.num_timesteps) / steps_per_rollout)
 
+    def _learning_starts_of_agents(self) -> list[int]:
+        """Return the random steps of each agent that the environments are divided among: here of one agent."""
+        return [self.learning_starts]
+
     def _print_warm_up(self, total_timesteps: int) -> None:
-        n_random = min(self.learning_starts, total_timesteps) - self.num_timesteps
-        if self.verbose >= 1 and n_random > 0:
-            n_steps = total_timesteps - self.num_timesteps
-            advice = " That is more than half: a smaller `learning_starts` trains more." if 2 * n_random > n_steps else ""
+        starts = self._learning_starts_of_agents()
+        n_done, n_total = self.num_timesteps // len(starts), math.ceil(total_timesteps / len(starts))
+        n_random = [max(min(start, n_total) - n_done, 0) for start in starts]
+        if self.verbose >= 1 and max(n_random) > 0:
+            n_steps = n_total - n_done
+            advice = " That is more than half: a smaller `learning_starts` trains more." if 2 * max(n_random) > n_steps else ""
             print(
-                f"Actions are random in the next {n_random:,} of {n_steps:,} environment steps "
-                f"(learning_starts={self.learning_starts}), without gradient steps.{advice}"
+                f"Actions are random in the next {_range_in_words(n_random)} of {n_steps:,} environment steps"
+                f"{self._of_each_agent} (learning_starts={_range_in_words(starts, '')}), without gradient steps.{advice}"
             )
+
+    @property
+    def _of_each_agent(self) -> str:
+        return " of each agent" if len(self._learning_starts_of_agents()) > 1 else ""
 
     @property
     def _trains_by_episode(self) -> bool:
@@ -90,20 +101,29 @@ class LearningStartsGuard(OffPolicyAlgorithm):
         if last_timestep > self.learning_starts or self.gradient_steps == 0:
             return
         self._has_warned = True
+        # The numbers of one agent, as the arguments are
+        starts = self._learning_starts_of_agents()
+        last_timestep //= len(starts)
         # As in the sweeps of `benchmark`
-        start = self._num_timesteps_at_start
+        start = self._num_timesteps_at_start // len(starts)
         example = start + (last_timestep - start) // 10
         has_learnt = self._n_updates > 0 and start == 0
         continuing = ", or continue the training before this one with `reset_num_timesteps=False`" if has_learnt else ""
         warnings.warn(
-            f"Nothing is learnt: the training ends at environment step {last_timestep}{certainty}, and gradient steps begin "
-            f"after step learning_starts={self.learning_starts}. Give more `total_timesteps`, or a smaller `learning_starts`, "
-            f"such as {example}{continuing}.",
+            f"Nothing is learnt: the training ends at environment step {last_timestep}{self._of_each_agent}{certainty}, and "
+            f"gradient steps begin after step learning_starts={min(starts)}. Give more `total_timesteps`, or a smaller "
+            f"`learning_starts`, such as {example}{continuing}.",
             stacklevel=2,
         )
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_has_trained", "_has_warned"]
+
+
+def _range_in_words(numbers: Sequence[int], thousands: str = ",") -> str:
+    """Return the smallest and the largest of some numbers as text, with a separator of thousands."""
+    low, high = (format(number, thousands) for number in (min(numbers), max(numbers)))
+    return low if low == high else f"{low} to {high}"
 
 
 def _longest_episode(env: VecEnv | None) -> int | None:

@@ -80,6 +80,9 @@ class PopulationTraining(
         """The agents whose training has failed, and why. Their parameters do not change any more."""
         return {index: reason for index, reason in enumerate(self._failures) if reason is not None}
 
+    def _learning_starts_of_agents(self) -> list[int]:
+        return [int(number) for number in self._counts["learning_starts"]]
+
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
