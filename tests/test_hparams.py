@@ -216,7 +216,12 @@ def test_a_run_of_rl_zoo3_fills_the_tab(given, monkeypatch, tmp_path):
     train()
     tab = Tab(tmp_path / "tensorboard")
     (row,), (metrics,) = tab.rows(), tab.metrics()
-    assert (row["algorithm"], row["cem_samples"], row["seed"], row["learning_rate"]) == ("CGP", 12, 3, 2e-3)
+    assert (row["algorithm"], row["cem_samples"], row["seed"], row["learning_rate"]) == (
+        "CGP",
+        12,
+        3,
+        "schedule from 0.002 to 0",
+    )
     if given:
         assert metrics == {"eval/mean_ep_length": 200}
     else:
