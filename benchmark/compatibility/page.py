@@ -38,6 +38,7 @@ NOTES = """\
 `make test-environments` installs each package into a virtual environment of its own, repeats the checks, and writes the
 records and this page to `results/environments/environments.md`.
 """
+NEXT = "Next: [your own environment](environments.md), [stop and resume](resuming.md), [on a robot](robot.md).\n"
 UNKNOWN = "–"
 
 
@@ -60,6 +61,7 @@ def page(records: Mapping[str, dict[str, Any]]) -> str:
             NOTES,
             *([f"Not tested yet: {', '.join(missing)}.\n"] if missing else []),
             *sections,
+            NEXT,
         ]
     )
 
