@@ -1,5 +1,6 @@
 """
-Measure the time of one CEM call by its sizes and data types, beside the plain implementation and beside bare matrix products.
+Measure the time of one CEM call by its sizes and data types, beside a straightforward implementation and its matrix
+products alone.
 
 ``python -m benchmark.selector`` writes ``selector.md`` and ``selector.json``.
 """

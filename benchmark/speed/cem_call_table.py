@@ -8,15 +8,15 @@ from benchmark.speed.products import Sizes
 
 NOTES = """\
 Milliseconds of one CEM call on a Q-network with {n_features} features, two hidden layers and ReLU: medians of {rounds}
-calls, everything in the table taken in turn; one size is varied at a time around the first lines'. "/ plain" is the ratio
-to the same call with the observation repeated for every sample in float32; "of products" the time of the bare products
-over the call's. Both are medians of the ratios within each round.
+rounds, in each of which every call of the table is timed once; one size is varied at a time around those of the first rows.
+"plain" is the same call with the observation repeated for every sample, in float32, and "/ plain" the ratio to it. "of
+products" is the time of the critic's matrix products alone, without activations, over the time of the call. Both are medians
+of the ratios within each round.
 
-The bare products are all the critic's: hidden activations, (batch × samples, width), by the second layer's weights,
-(width, width), once per iteration and in the same data type; and in float32 the first layer's parts for states (once)
-and actions, and the last layer. Operands lie ready and no activation is applied. For the hidden ones the fastest of
-PyTorch's kernels counts, in one piece and in blocks of several sizes; "of hidden" is their share alone. GFLOP/s counts the
-same products."""
+The products are: hidden activations, (batch × samples, width), by the second layer's weights, (width, width), once per
+iteration and in the same data type; and in float32 the first layer's parts for states (once) and actions, and the last
+layer. For the hidden ones the fastest of PyTorch's kernels counts, in one piece and in blocks of several sizes; "of hidden"
+is their share alone. GFLOP/s counts the same products."""
 
 
 def markdown(record: dict[str, Any]) -> str:

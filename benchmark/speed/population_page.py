@@ -22,7 +22,7 @@ ESTIMATE = """\
 the population's code. They are turned into seconds by the rates of the {name} ({source}: {tflops:.0f} TFLOP/s in float32
 without tensor cores, {bandwidth:.2f} TB/s), which are upper bounds of what programs reach, and by the costs of launches that
 follow from recorded times of one agent on that card (`benchmark/results/runtime_gpu`): {graph:.1f} us for an operator within
-a CUDA graph, {host:.0f} us for one that the host launches on its own, {rest:.2f} ms of other work on the host, which is taken
+a CUDA graph, {host:.0f} us for one that the CPU launches on its own, {rest:.2f} ms of other work on the CPU, which is taken
 to be the same for all numbers of agents. A simulator's step is taken as {simulator:.0f} us (`benchmark/results/runtime`,
 random actions) on each of {cores} cores; messages between processes are left out. "/ one" is the ratio to one agent's
 estimate; "of the card" the operations of the products per second of the step, as a share of the card's rate."""
