@@ -33,7 +33,7 @@ NOTES = """\
 - **learns**: the mean return of 20 episodes, first by random actions, then by the actor after a training of that many steps;
   and how many of the episodes were successful, where the environment reports it. The arguments are in
   `benchmark/compatibility/packages.py`.
-- "–": not checked, or the check was interrupted.
+- "–": not checked, or the check was interrupted. A "+" after a commit: files differed from it.
 
 `make test-environments` installs each package into a virtual environment of its own, repeats the checks, and writes the
 records and this page to `results/environments/environments.md`.
