@@ -26,7 +26,7 @@ ALONE = (5.6, 3.6)
 def curves_by_steps(study: Study, task: str, repetitions: int = REPETITIONS) -> bytes:
     """
     Draw a task's learning curves: every seed, their interquartile mean, and its 95 % interval. Published mean returns within
-    the range of steps are hollow markers.
+    the range of steps are open markers.
 
     :param study: the study
     :param task: the task
