@@ -140,7 +140,7 @@ def hindsight(n_envs=1, length=7, **kwargs):
             dict(n_envs=4, learning_starts=20),
             r"the 4 environment.*it has 6 steps of each.* is 20 and counts .* to 4 x the longest",
         ),
-        (dict(buffer_size=10, length=20, learning_starts=30), r"room of 10 steps .* `buffer_size`.* to 2 x the longest"),
+        (dict(buffer_size=10, length=20, learning_starts=30), r"size of 10 steps .* `buffer_size`.* to 2 x the longest"),
     ],
 )
 def test_hindsight_without_a_whole_episode_says_why_and_what_to_do(arguments, message):

@@ -110,7 +110,7 @@ def _explain_no_episode(buffer: HerReplayBuffer, learning_starts: int) -> str:
     )
     if buffer.full:
         return (
-            f"{cause}: its room of {buffer.buffer_size} steps of each environment does not hold a whole episode while another "
+            f"{cause}: its size of {buffer.buffer_size} steps of each environment does not hold a whole episode while another "
             f"one overwrites it. Raise `buffer_size`, which the environments share, to {2 * buffer.n_envs} x the longest "
             "episode or more, or limit the episodes' length (`max_episode_steps`)."
         )
