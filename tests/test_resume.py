@@ -315,6 +315,10 @@ def test_callbacks_that_are_gone_are_named(tmp_path):
     class Counting(Stop):
         counted = 0
 
+        def _on_step(self):
+            self.counted += 1
+            return super()._on_step()
+
     training = Training(tmp_path)
     model = CGP("MlpPolicy", training.make_env(1), policy_kwargs=dict(net_arch=[8]), **SMALL)
     callbacks = CallbackList([TrainingCheckpointCallback(10, tmp_path / "state"), Counting(47)])

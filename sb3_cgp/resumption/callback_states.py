@@ -2,16 +2,19 @@
 
 import warnings
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
-from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
+from sb3_cgp.resumption.plain_data import equal_plain, plain_attributes, set_plain_attributes
 from sb3_cgp.resumption.replay_buffers import constructor_arguments
 
 State = dict[str, Any]
+# The attributes of every callback of SB3, which follow from the training
+COMMON = {"n_calls", "num_timesteps", "verbose", "locals", "globals", "parent"}
 
 
 def iter_callbacks(callback: BaseCallback) -> list[BaseCallback]:
@@ -30,15 +33,26 @@ def iter_callbacks(callback: BaseCallback) -> list[BaseCallback]:
     return found
 
 
-def callback_states(callback: BaseCallback, training_env: VecEnv) -> list[State]:
+def initial_attributes(callback: BaseCallback) -> dict[int, State]:
+    """
+    Return the attributes that callbacks have before a training, so that those that a training changes can be told.
+
+    :param callback: the training's callback
+    :return: plain data by the callback's ``id``, for each callback
+    """
+    return {id(each): plain_attributes(each, without=_unsaved(each)) for each in iter_callbacks(callback)}
+
+
+def callback_states(callback: BaseCallback, training_env: VecEnv, initial: Mapping[int, State]) -> list[State]:
     """
     Return the states of all callbacks.
 
     :param callback: the training's callback
     :param training_env: the training's environment, which is not saved with a callback
+    :param initial: the attributes before the training, by :func:`initial_attributes`
     :return: plain data, for each callback in the order of :func:`iter_callbacks`
     """
-    return [_callback_state(each, training_env) for each in iter_callbacks(callback)]
+    return [_callback_state(each, training_env, initial.get(id(each), {})) for each in iter_callbacks(callback)]
 
 
 def warn_of_unrestorable(callback: BaseCallback, training_env: VecEnv) -> list[str]:
@@ -77,7 +91,8 @@ def restore_callbacks(callback: BaseCallback, states: list[State]) -> None:
         found = present.get((name, saved[name]))
         saved[name] += 1
         if found is None:
-            if state["environments"] or not name.startswith("stable_baselines3."):
+            # States that were saved before this was noted warn as before
+            if state["environments"] or state.get("has_counted", not name.startswith("stable_baselines3.")):
                 warnings.warn(f"A {name} was among the callbacks, and is not now: what it counted is lost.", stacklevel=2)
             continue
         _restore_callback(found, state)
@@ -96,13 +111,21 @@ def _restore_callback(callback: BaseCallback, state: State) -> None:
             restore_environment(getattr(callback, attribute), environment)
 
 
-def _callback_state(callback: BaseCallback, training_env: VecEnv) -> State:
+def _callback_state(callback: BaseCallback, training_env: VecEnv, initial: State) -> State:
     environments = {name: environment_state(env) for name, env in _environments(callback, training_env).items()}
     state: State = {"class": _class_name(callback), "environments": environments}
     if hasattr(callback, "get_training_state"):
-        return state | {"own": callback.get_training_state()}
-    unsaved = {"locals", "globals", *constructor_arguments(type(callback))}
-    return state | {"attributes": plain_attributes(callback, without=unsaved)}
+        own = callback.get_training_state()
+        counted = own.keys() - COMMON if isinstance(own, dict) else own is not None
+        return state | {"own": own, "has_counted": bool(counted)}
+    attributes = plain_attributes(callback, without=_unsaved(callback))
+    changed = [name for name in attributes.keys() - COMMON if not equal_plain(attributes[name], initial.get(name))]
+    return state | {"attributes": attributes, "has_counted": bool(changed)}
+
+
+def _unsaved(callback: BaseCallback) -> set[str]:
+    """Return the names of the attributes that a resumed training gives anew."""
+    return {"locals", "globals", *constructor_arguments(type(callback))}
 
 
 def _environments(callback: BaseCallback, training_env: VecEnv) -> dict[str, VecEnv]:

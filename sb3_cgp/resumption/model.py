@@ -13,7 +13,7 @@ from sb3_cgp.resumption.locks import FolderLock
 
 State = dict[str, Any]
 # The attributes below, which describe a running training and are not part of SB3's zip
-UNSAVED = ("callback", "resumption", "saved_to", "_folder_locks", "_n_nested_trainings", "_warned_of")
+UNSAVED = ("callback", "resumption", "saved_to", "_folder_locks", "_n_nested_trainings", "_warned_of", "_initial_callbacks")
 
 
 class ResumableModel(OffPolicyAlgorithm):
@@ -21,6 +21,8 @@ class ResumableModel(OffPolicyAlgorithm):
 
     # The callbacks of the training that is running
     callback: BaseCallback | None = None
+    # The attributes of the callbacks before the training, by `id`
+    _initial_callbacks: Mapping[int, State] = MappingProxyType({})
     # The loaded state, until the next `learn` has restored it
     resumption: State | None = None
     # The manifests' digests by state file, for each folder that holds states of this training
@@ -87,7 +89,9 @@ class ResumableModel(OffPolicyAlgorithm):
         inherited = getattr(super(), "__getstate__", None)
         state = vars(self) if inherited is None else inherited()
         # A copy does not take part in the running training, and has neither its callbacks nor its locks
-        kept = {name: value for name, value in state.items() if name not in ("callback", "_folder_locks")}
+        kept = {
+            name: value for name, value in state.items() if name not in ("callback", "_folder_locks", "_initial_callbacks")
+        }
         return kept | {"_n_nested_trainings": 0}
 
     def _excluded_save_params(self) -> list[str]:

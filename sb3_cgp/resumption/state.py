@@ -52,7 +52,7 @@ def gather(model: ResumableModel, callback: BaseCallback) -> State:
         "environment": environment,
         "not_restorable": None if environment is not None else " ".join(obstacles(model.env)),
         "statistics": None if normalizer is None else plain_attributes(normalizer, set(vars(normalizer)) - set(STATISTICS)),
-        "callbacks": callback_states(callback, model.env),
+        "callbacks": callback_states(callback, model.env, model._initial_callbacks),
         "logger": _pending(model.logger),
         "log_folder": None if model.logger.dir is None else os.path.abspath(model.logger.dir),
         "random": _random_state(model),
