@@ -116,6 +116,21 @@ class Watch(BaseCallback):
             steps, seconds = self.started
             self.steps_per_second = (self.num_timesteps - steps) / (time.process_time() - seconds)
 
+    def get_training_state(self) -> dict[str, Any]:
+        """
+        Return no state, as a resumed training is not measured.
+
+        :return: an empty dictionary
+        """
+        return {}
+
+    def set_training_state(self, state: dict[str, Any]) -> None:
+        """
+        Restore nothing.
+
+        :param state: not used
+        """
+
 
 def make_env(code: str) -> Any:
     """
