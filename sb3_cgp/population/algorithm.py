@@ -48,6 +48,8 @@ class Population(ResumableAlgorithm, PopulationMembers):
     :param agents: the number of agents, or for each agent a dictionary of the arguments that it does not share: ``seed``,
         ``learning_rate``, ``actor_learning_rate``, ``learning_starts``, ``tau``, ``gamma``, ``action_noise``,
         ``policy_delay``, ``target_update_interval``, ``target_policy_noise`` and ``target_noise_clip``
+    :param overlap: whether gradient steps are taken while the environments take their step, in the processes of
+        :func:`make_population_env`. It changes what is learnt: a gradient step cannot sample the newest transition.
     :param device: Device (cpu, cuda, ...) on which the code should be run.
     :param arguments: CGP's arguments for all agents. With ``seed``, agent i has the seed ``seed + i``.
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
@@ -56,7 +58,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = CGP.policy_aliases
     # For TensorBoard's tab HParams. SB3's attributes, such as `gamma`, have not the agents' values, which are in `agents`.
-    hyperparameter_names: ClassVar[tuple[str, ...]] = ("agents", "device")
+    hyperparameter_names: ClassVar[tuple[str, ...]] = ("agents", "overlap", "device")
 
     def __init__(
         self,
@@ -64,11 +66,13 @@ class Population(ResumableAlgorithm, PopulationMembers):
         env: GymEnv | str | None,
         agents: int | Sequence[Arguments] = 1,
         *,
+        overlap: bool = False,
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
         **arguments: Any,
     ):
         self.agents = merge_arguments(agents, arguments)
+        self.overlap = overlap
         self.cuda_graphs = self.agents[0].get("cuda_graphs", True)
         self._failures: list[str | None] = [None] * len(self.agents)
         self._agent_updates = np.zeros(len(self.agents), dtype=np.int64)
@@ -105,6 +109,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
         check_networks(agents[0])
         for name in ("batch_size", "n_steps", "train_freq", "gradient_steps"):
             setattr(self, name, getattr(agents[0], name))
+        self._check_overlap()
         # SB3 divides the one by the number of environments, and compares the other with the steps of all
         self.buffer_size = n_agents * agents[0].buffer_size
         self.learning_starts = n_agents * min(agent.learning_starts for agent in agents)

@@ -8,10 +8,10 @@ from sb3_cgp.algorithm import CGP
 from sb3_cgp.common.random_state import preserved_random_state
 from sb3_cgp.population.agents import make_agent
 from sb3_cgp.population.replay import copied_column
-from sb3_cgp.population.training import PopulationTraining
+from sb3_cgp.population.overlap import OverlappedTraining
 
 
-class PopulationMembers(PopulationTraining):
+class PopulationMembers(OverlappedTraining):
     """The part of :class:`~sb3_cgp.population.algorithm.Population` that copies its agents into CGPs, and back."""
 
     # Whether the actors have been trained offline
