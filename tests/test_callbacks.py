@@ -229,6 +229,26 @@ def test_ctrl_c_that_is_ignored_or_handled_by_others_stays_so(is_ignored, tmp_pa
     assert seen == ([] if is_ignored else ["theirs"])
 
 
+@pytest.mark.usefixtures("heeds_interruptions")
+@pytest.mark.parametrize("at", [33, 50], ids=["within", "last step"])
+def test_several_callbacks_save_before_a_signal_ends_the_training(at, tmp_path):
+    ended, folders = [], [tmp_path / "one", tmp_path / "other"]
+    stop = Do(at, lambda: signal.raise_signal(signal.SIGINT))
+    stop._on_training_end = lambda: ended.append(True)
+    with pytest.raises(KeyboardInterrupt, match=f"its state of step {at} is in .*one"):
+        make_model().learn(50, [*(TrainingCheckpointCallback(100, folder) for folder in folders), stop])
+    assert [StateStore(folder).load()[0] for folder in folders] == [at, at]
+    assert ended == [True] * (at == 50)
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+def test_a_handler_that_a_callback_sets_is_kept(tmp_path, handler):
+    theirs = lambda *_: None  # noqa: E731
+    make_model().learn(30, [TrainingCheckpointCallback(10, tmp_path), Do(20, lambda: signal.signal(signal.SIGTERM, theirs))])
+    assert signal.getsignal(signal.SIGTERM) is theirs
+    signal.signal(signal.SIGTERM, handler)
+
+
 def test_in_another_thread_states_are_saved_and_signals_left_alone(tmp_path):
     thread = threading.Thread(target=lambda: make_model().learn(30, TrainingCheckpointCallback(10, tmp_path)))
     thread.start()

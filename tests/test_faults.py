@@ -339,9 +339,22 @@ def test_ctrl_c_saves_the_state_and_is_raised_by_learn(tmp_path, capfd):
     handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt, match=r"its state of step 73 is in .*stopped; `resume` continues it"):
         learn(tmp_path / "stopped", function=lambda: signal.raise_signal(signal.SIGINT))
-    assert "stops after this step, and saves its state. Press Ctrl-C again to stop at once" in capfd.readouterr().err
+    assert "saves its state and stops when this rollout is over. Press Ctrl-C again to stop at once" in capfd.readouterr().err
     assert signal.getsignal(signal.SIGINT) is handler
     assert_resumes(tmp_path / "stopped", 73, learn(tmp_path / "straight"))
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+def test_an_error_after_ctrl_c_is_not_hidden(tmp_path, monkeypatch):
+    def fill_disk(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def interrupt():
+        monkeypatch.setattr(StateStore, "save", fill_disk)
+        signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(OSError, match="No space left"):
+        learn(tmp_path, function=interrupt)
 
 
 @pytest.mark.usefixtures("heeds_interruptions")

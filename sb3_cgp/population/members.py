@@ -7,8 +7,8 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_cgp.algorithm import CGP
 from sb3_cgp.common.random_state import preserved_random_state
 from sb3_cgp.population.agents import make_agent
-from sb3_cgp.population.replay import copied_column
 from sb3_cgp.population.overlap import OverlappedTraining
+from sb3_cgp.population.replay import copied_column
 
 
 class PopulationMembers(OverlappedTraining):

@@ -3,6 +3,7 @@
 import copy
 import io
 import os
+import signal
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +19,7 @@ from sb3_cgp.common.files import whole_file
 from sb3_cgp.common.load_arguments import check_load_arguments
 from sb3_cgp.common.rules import require
 from sb3_cgp.resumption.callback_states import initial_attributes, iter_callbacks
-from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
+from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback, checkpoints_among
 from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.logs import continued_logger
 from sb3_cgp.resumption.model import ResumableModel
@@ -26,6 +27,9 @@ from sb3_cgp.resumption.progress_bars import show_whole_training
 from sb3_cgp.resumption.replay_buffers import fill_replay_buffer
 from sb3_cgp.resumption.state import begin_new_episode, check_fits
 from sb3_cgp.resumption.store import StateStore
+
+# The errors of an environment whose process has ended
+LOST_PROCESS = (EOFError, ConnectionError)
 
 SelfResumableAlgorithm = TypeVar("SelfResumableAlgorithm", bound="ResumableAlgorithm")
 
@@ -217,10 +221,14 @@ class ResumableAlgorithm(ResumableModel):
         self._n_nested_trainings += 1
         try:
             yield
-        except Exception:
-            for each in self._checkpoints():
-                each.stop_if_interrupted()
+        except Exception as error:
+            # A terminal sends Ctrl-C to the environments' processes, too, which end by it
+            if self._is_interrupted and any(isinstance(each, LOST_PROCESS) for each in (error, error.__cause__)):
+                self._stop_if_asked()
             raise
+        else:
+            # The signal came during the last step or the saving of its state. The code after `learn` could take too long.
+            self._stop_if_asked()
         finally:
             self._n_nested_trainings -= 1
             for each in self._checkpoints():
@@ -234,8 +242,16 @@ class ResumableAlgorithm(ResumableModel):
 
     def _checkpoints(self) -> list[TrainingCheckpointCallback]:
         """Return the callbacks of the training in progress that save states."""
-        callbacks = () if self.callback is None else iter_callbacks(self.callback)
-        return [each for each in callbacks if isinstance(each, TrainingCheckpointCallback)]
+        return [] if self.callback is None else checkpoints_among(self.callback)
+
+    @property
+    def _is_interrupted(self) -> bool:
+        """Whether Ctrl-C has been pressed."""
+        return any(each.signals.noted == signal.SIGINT for each in self._checkpoints())
+
+    def _stop_if_asked(self) -> None:
+        for each in self._checkpoints():
+            each.stop_if_asked()
 
 
 def resumable(algorithm: type[OffPolicyAlgorithm]) -> type[ResumableAlgorithm]:

@@ -1,13 +1,12 @@
 """A callback that saves the complete training state, so that an interrupted training can be resumed."""
 
-import signal
 import warnings
 from pathlib import Path
-from typing import NoReturn
 
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cgp.common.rules import require, require_count
+from sb3_cgp.resumption.callback_states import iter_callbacks
 from sb3_cgp.resumption.model import ResumableModel
 from sb3_cgp.resumption.replay_buffers import check_replay_buffer
 from sb3_cgp.resumption.signals import StopSignals
@@ -99,11 +98,16 @@ class TrainingCheckpointCallback(BaseCallback):
         self._restore_if_resumed()
         if self.path is None:
             return
-        if self.signals.noted is not None:
+        assert self.model.callback is not None
+        saving = [each for each in checkpoints_among(self.model.callback) if each.path is not None]
+        asked = next((each for each in saving if each.signals.noted is not None), None)
+        if asked is not None:
             if self.num_timesteps > self._saved_at or not self.has_state:
                 self._save()
-            self._stop()
-        if self.num_timesteps // self.save_freq > self._saved_at // self.save_freq:
+            # The others save, too
+            if self is saving[-1]:
+                asked.stop_if_asked()
+        elif self.num_timesteps // self.save_freq > self._saved_at // self.save_freq:
             self._save()
 
     def _on_step(self) -> bool:
@@ -112,8 +116,7 @@ class TrainingCheckpointCallback(BaseCallback):
             self._is_within_step = True
         else:
             self._has_trained_without_rollouts = True
-            if self.signals.noted is not None:
-                self._stop()
+            self.stop_if_asked()
         return True
 
     def _on_rollout_end(self) -> None:
@@ -128,9 +131,6 @@ class TrainingCheckpointCallback(BaseCallback):
         if self.path is not None and is_whole:
             self._save()
         self.signals.restore()
-        # The signal came during the last step or the saving of its state. The code after `learn` could take too long.
-        if self.signals.noted is not None:
-            self._stop()
 
     def get_training_state(self) -> dict[str, int]:
         """
@@ -166,24 +166,28 @@ class TrainingCheckpointCallback(BaseCallback):
         if self.verbose >= 2:
             print(f"Saving the training state of step {self.num_timesteps} to {self.path}")
 
-    def stop_if_interrupted(self) -> None:
+    def stop_if_asked(self) -> None:
         """
-        Take an error for a consequence of Ctrl-C, if that was pressed: a terminal sends it to environments' processes, too.
+        End the training if a signal has asked for it.
 
-        :raises KeyboardInterrupt: if Ctrl-C was pressed
+        :raises KeyboardInterrupt: after Ctrl-C
+        :raises SystemExit: after SIGTERM
         """
-        if self.signals.noted == signal.SIGINT:
-            self._stop()
-
-    def _stop(self) -> NoReturn:
-        kept = (
-            f"its state of step {self._saved_at} is in {self.path}; `resume` continues it"
-            if self.has_state
-            else "it has no state"
-        )
-        self.signals.end(f"The training was interrupted: {kept}")
+        if self.signals.noted is not None:
+            kept = f"its state of step {self._saved_at} is in {self.path}; `resume` continues it"
+            self.signals.end(f"The training was interrupted: {kept if self.has_state else 'it has no state'}")
 
     def release(self) -> None:
         """Restore the signals' handlers. Save no state until the next training starts, as this one may have failed."""
         self._rollout_is_over = self._has_trained_without_rollouts = False
         self.signals.restore()
+
+
+def checkpoints_among(callback: BaseCallback) -> list[TrainingCheckpointCallback]:
+    """
+    Return the callbacks that save states.
+
+    :param callback: the training's callback
+    :return: those among it and the callbacks within it
+    """
+    return [each for each in iter_callbacks(callback) if isinstance(each, TrainingCheckpointCallback)]

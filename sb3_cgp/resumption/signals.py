@@ -6,7 +6,7 @@ import threading
 from types import FrameType
 from typing import Any, NoReturn
 
-MESSAGE = b"\nThe training stops after this step, and saves its state. Press Ctrl-C again to stop at once, without saving.\n"
+MESSAGE = b"\nThe training saves its state and stops when this rollout is over. Press Ctrl-C again to stop at once.\n"
 
 
 class StopSignals:
@@ -25,8 +25,8 @@ class StopSignals:
         """
         Handle the signals, until :meth:`restore`.
 
-        It has no effect in another thread than the main one, where Python sets no handlers, on a signal that another such
-        object handles, and on SIGINT if it is ignored or has another handler than Python's own.
+        It has no effect in another thread than the main one, where Python sets no handlers, on a signal that is ignored or
+        that another such object handles, and on SIGINT if it has another handler than Python's own.
         """
         self.noted = None
         if threading.current_thread() is not threading.main_thread():
@@ -37,13 +37,14 @@ class StopSignals:
             is_watched = isinstance(getattr(handler, "__self__", None), StopSignals)
             is_python_s = number == signal.SIGTERM or handler is signal.default_int_handler
             # A handler that Python has not set (None) could not be restored
-            if handler is not None and not is_watched and is_python_s:
+            if handler not in (None, signal.SIG_IGN) and not is_watched and is_python_s:
                 self._previous[number] = signal.signal(number, self._note)
 
     def restore(self) -> None:
-        """Restore the handlers that the signals had."""
+        """Restore the handlers that the signals had, but for those that others have set since."""
         for number, handler in self._previous.items():
-            signal.signal(number, handler)
+            if signal.getsignal(number) == self._note:
+                signal.signal(number, handler)
         self._previous = {}
 
     def end(self, reason: str) -> NoReturn:
