@@ -54,8 +54,8 @@ class CGP(
         it can be a function of the current progress remaining (from 1 to 0), or a string such as ``"lin_1e-3"`` for a
         linear schedule that ends at 0
     :param buffer_size: size of the replay buffer
-    :param learning_starts: how many random steps to take before learning starts; with few, CGP often fails
-        (the paper's Appendix A)
+    :param learning_starts: how many random steps to take before learning starts; with few, some seeds fail
+        in the paper (Appendix A)
     :param batch_size: Minibatch size for each gradient update
     :param tau: the soft update coefficient of the targets and the averaged actor ("Polyak update", between 0 and 1)
     :param gamma: the discount factor
