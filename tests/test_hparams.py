@@ -173,7 +173,7 @@ def test_arguments_that_a_subclass_passes_on_are_shown(derived, algorithm, furth
 def test_a_population_shows_its_agents_and_no_attribute_of_sb3s():
     population = Population("MlpPolicy", "Pendulum-v1", [dict(gamma=0.5), dict(gamma=0.6)], **tiny())
     shown = hyperparameters(population)
-    assert shown.keys() == {"agents", "device", "algorithm", "policy", "n_envs"}
+    assert shown.keys() == {"agents", "overlap", "device", "algorithm", "policy", "n_envs"}
     assert "'gamma': 0.6" in shown["agents"]
 
 
