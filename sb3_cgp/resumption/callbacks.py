@@ -56,6 +56,8 @@ class TrainingCheckpointCallback(BaseCallback):
         # `learn` may end in the middle of a step, and a training without rollouts may follow
         self._is_within_step = False
         self.signals = StopSignals()
+        # This callback and the training's others that save states, in the order in which SB3 calls them
+        self._saving: list[TrainingCheckpointCallback] = []
 
     @property
     def path(self) -> str | Path | None:
@@ -90,6 +92,8 @@ class TrainingCheckpointCallback(BaseCallback):
         is_another = not self._store.digests() <= known
         allowed = "a folder without the states of another training: continue that one by `resume`, or choose another folder"
         require(not is_another, "path", str(self.path), allowed)
+        assert self.model.callback is not None
+        self._saving = [each for each in checkpoints_among(self.model.callback) if each.path is not None]
         self.signals.watch()
 
     def _on_rollout_start(self) -> None:
@@ -98,14 +102,12 @@ class TrainingCheckpointCallback(BaseCallback):
         self._restore_if_resumed()
         if self.path is None:
             return
-        assert self.model.callback is not None
-        saving = [each for each in checkpoints_among(self.model.callback) if each.path is not None]
-        asked = next((each for each in saving if each.signals.noted is not None), None)
+        asked = next((each for each in self._saving if each.signals.noted is not None), None)
         if asked is not None:
             if self.num_timesteps > self._saved_at or not self.has_state:
                 self._save()
             # The others save, too
-            if self is saving[-1]:
+            if self is self._saving[-1]:
                 asked.stop_if_asked()
         elif self.num_timesteps // self.save_freq > self._saved_at // self.save_freq:
             self._save()
@@ -180,6 +182,7 @@ class TrainingCheckpointCallback(BaseCallback):
     def release(self) -> None:
         """Restore the signals' handlers. Save no state until the next training starts, as this one may have failed."""
         self._rollout_is_over = self._has_trained_without_rollouts = False
+        self._saving = []
         self.signals.restore()
 
 
