@@ -40,6 +40,13 @@ DIST_INSTALLED := $(STAMP)dist
 # An editable install holds copies of the version and of the start-up hook.
 REQUIREMENTS := setup.cfg setup.py pyproject.toml $(CONSTRAINTS) _build_backend.py sb3_cgp/version.txt
 
+# A misspelt variable would have no effect
+KNOWN := ALGO ENV SEED STEPS EVAL_FREQ EVAL_EPISODES THREADS LOGS PARAMS ARGS RUN PACKAGES PYTHON VENV CONSTRAINTS TAG ADDRESS
+UNKNOWN := $(filter-out $(KNOWN) MAKE% SHELL,$(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name))))
+ifneq ($(UNKNOWN),)
+$(error There is no variable $(UNKNOWN), but: $(KNOWN))
+endif
+
 .DEFAULT_GOAL := help
 .PHONY: help train resume sweeps docs test test-quick test-slow test-oldest test-environments lint format dist release-check clean
 

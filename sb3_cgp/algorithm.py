@@ -23,6 +23,7 @@ from sb3_cgp.fast.scoring import SCORING_DTYPES
 from sb3_cgp.guards.algorithm import GuardedAlgorithm
 from sb3_cgp.guards.arguments import check_callback
 from sb3_cgp.guards.losses import LossGuard
+from sb3_cgp.guards.names import suggests_names
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
 from sb3_cgp.selectors.algorithm import SelectorAlgorithm
 
@@ -119,6 +120,7 @@ class CGP(
         "MultiInputPolicy": MultiInputPolicy,
     }
 
+    @suggests_names
     def __init__(
         self,
         policy: str | type[CGPPolicy],
@@ -213,6 +215,35 @@ class CGP(
         super()._setup_model()
         self.policy.cem_dtype = self.cem_dtype  # type: ignore[assignment]
 
+    @suggests_names
+    def learn(
+        self: SelfCGP,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "CGP",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfCGP:
+        """
+        Train the model, or continue the training that :meth:`resume` has loaded.
+
+        With ``policy_training="offline"``, the policy is trained at the end, see :meth:`train_policy`.
+
+        :param total_timesteps: The total number of samples (env steps) to train on, an integer >= 0, or an equal float
+            such as 1e5
+        :param callback: callback(s) called at every step with state of the algorithm.
+        :param log_interval: number of episodes between two writings of the log; None for no writing
+        :param tb_log_name: the name of the run for TensorBoard logging
+        :param reset_num_timesteps: whether or not to reset the current timestep number (used in logging)
+        :param progress_bar: Display a progress bar using tqdm and rich.
+        :return: the trained model
+        :raises ValueError: naming an argument that is wrong, or the fault of an environment
+        :raises FolderInUseError: if a folder for training states is used by another training
+        """
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    @suggests_names
     def train_policy(
         self: SelfCGP,
         max_steps: int = 100_000,

@@ -78,6 +78,8 @@ def test_a_file_in_the_place_of_a_folder_is_refused_by_name(tmp_path):
         NotADirectoryError, match=r"Is a file, and no folder that `export` wrote; `load` reads a model: '.*zip'"
     ):
         CGP.load_weights(f"{path}.zip")
+    with pytest.raises(FileNotFoundError, match=r"no exported policy; `load` reads the model .*model\.zip: '.*model'"):
+        CGP.load_weights(path)
     before = Path(f"{path}.zip").read_bytes()
     with pytest.raises(FileExistsError, match=r"Is a file, and must be a folder or a new name: '.*zip'"):
         model.export(f"{path}.zip")

@@ -129,6 +129,13 @@ def test_settings_are_not_taken_from_the_environment(clone: Clone) -> None:
     assert "--env Pendulum-v1 --seed 0" in starting(calls, "-m rl_zoo3.train")[0]
 
 
+@pytest.mark.parametrize("goal", ["train", "test", "help"])
+def test_a_misspelt_variable_is_refused_before_anything_is_done(goal: str, clone: Clone) -> None:
+    calls, ended = clone.make(goal, "STEP=2500", "SEED=1")
+    assert (calls, ended.returncode) == ([], 2)
+    assert "There is no variable STEP, but: ALGO ENV SEED STEPS " in ended.stderr
+
+
 def test_failed_training_is_not_reported(clone: Clone) -> None:
     calls, ended = clone.make("train", FAIL="rl_zoo3.train")
     assert ended.returncode != 0

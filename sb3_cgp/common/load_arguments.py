@@ -11,7 +11,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import open_path
 
-from sb3_cgp.common.rules import nearest
+from sb3_cgp.common.rules import nearest, unknown_argument
 from sb3_cgp.common.sb3_arguments import constructor_argument_names
 
 # The parameters of SB3's `load` that may be given by keyword
@@ -45,15 +45,12 @@ def check_load_arguments(
     attributes = saved_attributes | _attributes(algorithm)
     for name in (name for name in unknown if name not in attributes):
         public = {each for each in attributes if not each.startswith("_")}
-        similar = nearest(name, PARAMETERS | own | public)
-        remedy = (
-            f"Did you mean `{similar}`?"
-            if similar is not None
-            else f"It takes {', '.join(sorted(PARAMETERS))}, the constructor's arguments {', '.join(sorted(own))}, and the "
+        usage = (
+            f"It takes {', '.join(sorted(PARAMETERS))}, the constructor's arguments {', '.join(sorted(own))}, and the "
             "names of attributes of the model."
         )
         called = f"{algorithm.__name__}.{method}"
-        raise TypeError(f"The value of `{name}` is {arguments[name]!r}, but `{called}` takes no such argument. {remedy}")
+        raise unknown_argument(called, name, arguments[name], PARAMETERS | own | public, usage=usage)
 
 
 def misspelt_custom_objects(saved: SavedModel, names: Iterable[str]) -> dict[str, str]:

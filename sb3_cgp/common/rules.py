@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from numbers import Integral, Real
 from typing import Any
 
@@ -31,6 +31,36 @@ def nearest(name: str, choices: Iterable[str], cutoff: float = 0.6) -> str | Non
     :return: the most similar name; None if no name is similar
     """
     return next(iter(difflib.get_close_matches(name, sorted(choices), n=1, cutoff=cutoff)), None)
+
+
+def unknown_argument(
+    called: str,
+    name: str,
+    value: Any,
+    choices: Iterable[str],
+    remedies: Mapping[str, str] | None = None,
+    usage: str | None = None,
+) -> TypeError:
+    """
+    Return the error for a keyword argument that does not exist.
+
+    :param called: what was called, such as ``CGP.learn``
+    :param name: the argument's name
+    :param value: the argument's value
+    :param choices: the names that are allowed
+    :param remedies: sentences for names that are known to be given here by mistake
+    :param usage: a sentence where no name is similar; None for one that lists the choices
+    :return: the error
+    """
+    choices = sorted(choices)
+    similar = nearest(name, choices)
+    if remedies is not None and name in remedies:
+        remedy = remedies[name]
+    elif similar is not None:
+        remedy = f"Did you mean `{similar}`?"
+    else:
+        remedy = f"It takes {', '.join(choices)}." if usage is None else usage
+    return TypeError(f"The value of `{name}` is {value!r}, but `{called}` takes no such argument. {remedy}")
 
 
 def require_count(name: str, value: Any, minimum: int = 1) -> None:

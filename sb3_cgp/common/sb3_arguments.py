@@ -10,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
@@ -18,16 +19,16 @@ from sb3_cgp.common.rules import require, require_count, require_number
 LINEAR_SCHEDULE_PREFIX = "lin_"
 
 
-def constructor_argument_names(algorithm: type[BaseAlgorithm]) -> set[str]:
+def constructor_argument_names(of: type[BaseAlgorithm] | type[BasePolicy]) -> set[str]:
     """
-    Return the names of the arguments that an algorithm's constructor takes, those that it passes on to its bases included.
+    Return the names of the arguments that a constructor takes, those that it passes on to its bases included.
 
-    :param algorithm: the algorithm's class
+    :param of: the class of an algorithm or a policy
     :return: the names
     """
     names: set[str] = set()
     # In the order in which `super().__init__` goes through the constructors
-    for base in algorithm.__mro__:
+    for base in of.__mro__:
         if "__init__" not in vars(base):
             continue
         parameters = inspect.signature(vars(base)["__init__"]).parameters.values()

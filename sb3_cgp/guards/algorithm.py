@@ -1,6 +1,7 @@
 """All guards in one class, to be mixed into an off-policy algorithm of SB3's."""
 
 from sb3_cgp.guards.arguments import ArgumentGuard
+from sb3_cgp.guards.construction import ConstructionGuard
 from sb3_cgp.guards.dummy_vec_env import DummyVecEnvGuard
 from sb3_cgp.guards.episodes import EpisodeGuard
 from sb3_cgp.guards.explanations import ExplanationGuard
@@ -17,6 +18,7 @@ from sb3_cgp.guards.workers import WorkerGuard
 
 class GuardedAlgorithm(
     PathGuard,
+    ConstructionGuard,
     ArgumentGuard,
     SeedGuard,
     WorkerGuard,

@@ -10,11 +10,10 @@ from typing import Any, TypeVar
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_cgp.common.load_arguments import check_load_arguments, misspelt_custom_objects
-from sb3_cgp.common.rules import nearest, require
+from sb3_cgp.common.rules import require
 
 SelfArgumentGuard = TypeVar("SelfArgumentGuard", bound="ArgumentGuard")
 
@@ -24,22 +23,7 @@ CALLBACK = "an instance of a subclass of BaseCallback"
 
 
 class ArgumentGuard(OffPolicyAlgorithm):
-    """An algorithm that refuses wrong arguments of ``learn`` and ``load``, and unknown policies, when it is called."""
-
-    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
-        known = ", ".join(map(repr, self.policy_aliases))
-        similar = nearest(policy_name, self.policy_aliases)
-        advice = "" if similar is None else f" Did you mean {similar!r}?"
-        if policy_name not in self.policy_aliases:
-            raise ValueError(
-                f"The value of `policy` is {policy_name!r}, but must be one of {known}, or a class of policies.{advice}"
-            )
-        return super()._get_policy_from_name(policy_name)
-
-    def _setup_model(self) -> None:
-        allowed = f"a class of policies, or one of {', '.join(map(repr, self.policy_aliases))}"
-        require(isinstance(self.policy_class, type), "policy", self.policy_class, allowed)
-        super()._setup_model()
+    """An algorithm that refuses wrong arguments of ``learn`` and ``load`` when they are called."""
 
     def learn(
         self: SelfArgumentGuard, total_timesteps: int, callback: Any = None, log_interval: Any = 4, *args: Any, **kwargs: Any

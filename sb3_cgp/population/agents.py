@@ -14,6 +14,7 @@ from sb3_cgp.algorithm import CGP
 from sb3_cgp.common.rules import nearest, require, require_count
 from sb3_cgp.core import policies as core_policies
 from sb3_cgp.fast import policies as fast_policies
+from sb3_cgp.guards.construction import check_constructor_arguments
 from sb3_cgp.selectors import policies as selector_policies
 
 Arguments = dict[str, Any]
@@ -46,7 +47,7 @@ def merge_arguments(agents: int | Sequence[Arguments], common: Arguments) -> lis
     :param agents: the number of agents, or the arguments of each agent's own
     :param common: the arguments of all agents. A seed among them is the first agent's; the next ones count from it.
     :return: arguments of CGP, for each agent
-    :raises ValueError: if an argument is unknown, or differs between agents and may not
+    :raises ValueError: if an argument is unknown, of a wrong type, or differs between agents and may not
     """
     if not isinstance(agents, Sequence):
         require_count("agents", agents)
@@ -58,6 +59,8 @@ def merge_arguments(agents: int | Sequence[Arguments], common: Arguments) -> lis
         similar = nearest(name, (*OWN, *COMMON))
         advice = "" if similar is None else f"; the nearest name is `{similar}`"
         require(name in (*OWN, *COMMON), "arguments", name, f"one of {', '.join((*OWN, *COMMON))}{advice}")
+    for each in (common, *agents):
+        check_constructor_arguments(each)
     seed = common.get("seed")
     seeds = [{} if seed is None else {"seed": seed + index} for index in range(len(agents))]
     merged = [common | seeds[index] | own for index, own in enumerate(agents)]

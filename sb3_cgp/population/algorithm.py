@@ -15,6 +15,7 @@ from sb3_cgp.algorithm import CGP
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import as_schedule
 from sb3_cgp.core.policies import CGPPolicy
+from sb3_cgp.guards.names import suggests_names
 from sb3_cgp.guards.observations import innermost
 from sb3_cgp.population.agents import (
     COMMON,
@@ -79,7 +80,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
         first = self.agents[0]
         super().__init__(
             policy,
-            make_vec_env(env, n_envs=len(self.agents)) if isinstance(env, str) else env,  # type: ignore[arg-type]
+            make_vec_env(env, n_envs=len(self.agents)) if isinstance(env, str) else env,
             first.get("learning_rate", 1e-3),
             policy_kwargs=first.get("policy_kwargs"),
             replay_buffer_kwargs=first.get("replay_buffer_kwargs"),
@@ -157,6 +158,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
         allowed = "without VecNormalize, whose statistics all agents would share"
         require(self._vec_normalize_env is None, "env", self.env, allowed)
 
+    @suggests_names
     def learn(
         self: SelfPopulation,
         total_timesteps: int,

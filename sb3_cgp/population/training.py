@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_cgp.fast.cuda_graphs import RecordedFunction, Tensors, has_cuda_graphs
 from sb3_cgp.fast.replay import LeanReplayAlgorithm
 from sb3_cgp.guards.arguments import ArgumentGuard
+from sb3_cgp.guards.construction import ConstructionGuard
 from sb3_cgp.guards.dummy_vec_env import DummyVecEnvGuard
 from sb3_cgp.guards.episodes import EpisodeGuard
 from sb3_cgp.guards.explanations import ExplanationGuard
@@ -35,6 +36,7 @@ LOSSES = ("critic_loss", "q_value", "actor_loss")
 class PopulationTraining(
     # CGP's guards, but for those of networks, losses and VecNormalize: each agent's own CGP has tried its networks
     PathGuard,
+    ConstructionGuard,
     ArgumentGuard,
     SeedGuard,
     WorkerGuard,

@@ -1,0 +1,251 @@
+"""Wrong arguments of the constructor are refused by name, with the remedy, and environments are taken by their names."""
+
+import inspect
+import re
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from guarded import SMALL, GuardedTD3
+from small_models import make_model
+from stable_baselines3 import SAC, TD3
+
+from sb3_cgp import CGP
+from sb3_cgp.common.sb3_arguments import constructor_argument_names
+from sb3_cgp.core.policies import CGPPolicy
+from sb3_cgp.population import Population
+
+POLICY_ARGUMENTS = ["net_arch", "n_critics", "activation_fn", "optimizer_class", "features_extractor_class", "selector"]
+
+
+def make(**arguments):
+    return CGP("MlpPolicy", "Pendulum-v1", **SMALL | arguments)
+
+
+@pytest.mark.parametrize(
+    ("given", "similar"),
+    [
+        ("learning_rat", "learning_rate"),
+        ("cem_sample", "cem_samples"),
+        ("learning_start", "learning_starts"),
+        ("gama", "gamma"),
+    ],
+)
+def test_a_misspelt_argument_of_the_constructor_is_refused_with_the_nearest_one(given, similar):
+    message = rf"The value of `{given}` is 3, but `CGP` takes no such argument\. Did you mean `{similar}`\?"
+    with pytest.raises(TypeError, match=message):
+        make(**{given: 3})
+
+
+def test_an_argument_similar_to_none_is_refused_with_all_names():
+    with pytest.raises(TypeError, match=r"`CGP` takes no such argument\. It takes action_noise, .*cem_samples, .*verbose\."):
+        make(zzz=1)
+
+
+@pytest.mark.parametrize("name", POLICY_ARGUMENTS)
+def test_an_argument_of_the_policy_is_sent_to_policy_kwargs(name):
+    assert name in constructor_argument_names(CGPPolicy)
+    with pytest.raises(TypeError, match=f"`{name}` .*`CGP` takes no such argument.*policy_kwargs"):
+        make(**{name: 1})
+
+
+def own_arguments(other):
+    """Return the arguments of an algorithm of SB3's that CGP has not."""
+    return sorted(constructor_argument_names(other) - constructor_argument_names(CGP))
+
+
+@pytest.mark.parametrize("other", [TD3, SAC])
+def test_every_argument_that_only_another_algorithm_has_gets_a_remedy(other):
+    for name in own_arguments(other):
+        if name in constructor_argument_names(GuardedTD3):
+            continue
+        with pytest.raises(TypeError, match=r"`CGP` takes no such argument\. Leave it out: "):
+            make(**{name: 1})
+
+
+@pytest.mark.parametrize(
+    ("method", "given", "similar"),
+    [
+        ("learn", "progressbar", "progress_bar"),
+        ("learn", "total_timestep", "total_timesteps"),
+        ("train_policy", "max_step", "max_steps"),
+    ],
+)
+def test_a_misspelt_argument_of_a_method_is_refused_with_the_nearest_one(method, given, similar):
+    message = rf"The value of `{given}` is 5, but `CGP.{method}` takes no such argument\. Did you mean `{similar}`\?"
+    with pytest.raises(TypeError, match=message):
+        getattr(make(), method)(**{given: 5})
+
+
+def test_a_misspelt_argument_of_a_populations_learn_is_refused_with_the_nearest_one():
+    population = Population("MlpPolicy", "Pendulum-v1", 2, **SMALL)
+    with pytest.raises(TypeError, match=r"`Population.learn` takes no such argument\. Did you mean `progress_bar`\?"):
+        population.learn(5, progressbar=True)
+
+
+def test_learn_has_the_signature_of_sb3():
+    parameters, of_td3 = (inspect.signature(each.learn).parameters for each in (CGP, TD3))
+    assert list(parameters) == list(of_td3)
+    defaults = {name: each.default for name, each in of_td3.items()} | {"tb_log_name": "CGP"}
+    assert {name: each.default for name, each in parameters.items()} == defaults
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (dict(net_archh=[8]), "`net_archh` is .8., but `CGPPolicy` takes no such argument. Did you mean `net_arch`?"),
+        (dict(learning_rate=1), "Give it to `CGP`, outside `policy_kwargs`"),
+        (dict(log_std_init=-3), "Leave it out: the actor has no standard deviation"),
+        (dict(zzz=1), "It takes activation_fn, .*, share_features_extractor."),
+    ],
+)
+def test_an_unknown_argument_of_the_policy_is_refused_with_a_remedy(arguments, message):
+    with pytest.raises(TypeError, match=message.replace("?", r"\?")):
+        make(policy_kwargs=arguments)
+
+
+class PoppingPolicy(CGP.policy_aliases["MlpPolicy"]):
+    """Takes an argument that no signature names."""
+
+    def __init__(self, *args, **kwargs):
+        self.hidden_argument = kwargs.pop("hidden_argument")
+        super().__init__(*args, **kwargs)
+
+
+def test_an_argument_that_no_signature_of_a_users_policy_names_is_passed_on():
+    model = CGP(PoppingPolicy, "Pendulum-v1", **SMALL | dict(policy_kwargs=dict(net_arch=[4], hidden_argument=7)))
+    assert model.policy.hidden_argument == 7
+
+
+class FailingPolicy(CGP.policy_aliases["MlpPolicy"]):
+    """Calls a function of its own by a wrong name."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        dict.fromkeys(wrong=1)
+
+
+def test_an_error_of_a_users_policy_itself_is_not_replaced():
+    with pytest.raises(TypeError, match=r"fromkeys\(\) takes no keyword arguments"):
+        CGP(FailingPolicy, "Pendulum-v1", **SMALL)
+
+
+WRONG_VALUES = [
+    ("verbose", "1", "an integer: 0 for no output"),
+    ("policy_kwargs", [8], "None or a dictionary, such as dict(net_arch=[64, 64])"),
+    ("stats_window_size", "3", "an integer >= 1"),
+    ("stats_window_size", 0, "an integer >= 1"),
+    ("tensorboard_log", 3, "None or the path of a folder"),
+    ("seed", "a", "None or an integer within [0, 2**32)"),
+    ("seed", -1, "None or an integer within [0, 2**32)"),
+    ("device", "gpu", "'auto', a device of PyTorch's"),
+    ("replay_buffer_kwargs", [1], "None or a dictionary"),
+    ("replay_buffer_class", "HerReplayBuffer", "None or a class of replay buffers"),
+    ("replay_buffer_class", dict, "None or a class of replay buffers"),
+    ("optimize_memory_usage", "no", "True or False"),
+]
+
+
+@pytest.mark.parametrize("algorithm", [CGP, GuardedTD3])
+@pytest.mark.parametrize(("name", "value", "allowed"), WRONG_VALUES)
+def test_a_wrong_argument_is_refused_by_name_before_sb3_uses_it(algorithm, name, value, allowed):
+    message = re.escape(f"The value of `{name}` is {value!r}, but must be {allowed}")
+    with pytest.raises(ValueError, match=message):
+        algorithm("MlpPolicy", "Pendulum-v1", **SMALL | {name: value})
+
+
+@pytest.mark.parametrize("name", ["verbose", "stats_window_size", "seed"])
+def test_a_population_refuses_the_same_arguments(name):
+    with pytest.raises((ValueError, TypeError), match=f"`{name}` is 'x', but must be"):
+        Population("MlpPolicy", "Pendulum-v1", 2, **SMALL | {name: "x"})
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        dict(verbose=True),
+        dict(seed=np.int64(3)),
+        dict(tensorboard_log=Path("somewhere")),
+        dict(device=th.device("cpu")),
+        dict(policy_kwargs=None),
+    ],
+)
+def test_equivalent_values_are_taken(arguments):
+    make(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("activation_fn", "relu", "a class, such as torch.nn.ReLU"),
+        ("activation_fn", th.nn.ReLU(), "a class, such as torch.nn.ReLU"),
+        ("optimizer_class", "Adam", "a class, such as torch.optim.Adam"),
+        ("features_extractor_class", "FlattenExtractor", "a class, such as"),
+        ("optimizer_kwargs", 3, "None or a dictionary"),
+        ("n_critics", 0, "an integer >= 1"),
+        ("net_arch", 64, "None, a list of integers >= 1"),
+        ("net_arch", "64", "None, a list of integers >= 1"),
+        ("net_arch", [64.0], "None, a list of integers >= 1"),
+        ("net_arch", dict(pi=[4]), "None, a list of integers >= 1"),
+        ("net_arch", dict(pi=[4], vf=[4]), "None, a list of integers >= 1"),
+    ],
+)
+def test_a_wrong_argument_of_the_policy_is_refused_by_name(name, value, allowed):
+    message = re.escape(f"The value of `policy_kwargs['{name}']` is {value!r}, but must be {allowed}")
+    with pytest.raises(ValueError, match=message):
+        make(policy_kwargs={name: value})
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        dict(net_arch=[]),
+        dict(net_arch=dict(pi=[4], qf=[])),
+        dict(activation_fn=lambda: th.nn.LeakyReLU(0.1)),
+        dict(optimizer_class=th.optim.SGD, optimizer_kwargs=dict(momentum=0.9)),
+    ],
+)
+def test_valid_arguments_of_the_policy_are_taken(arguments):
+    make(policy_kwargs=dict(net_arch=[4]) | arguments, learning_starts=4).learn(8)
+
+
+@pytest.mark.parametrize("algorithm", [CGP, GuardedTD3])
+@pytest.mark.parametrize(
+    ("env", "remedy"),
+    [
+        (None, "only `load` needs none"),
+        (3, "the name of a registered environment"),
+        ([gym.make], "the name of a registered environment"),
+        (gym.Wrapper, re.escape("write `Wrapper(...)`, with its arguments")),
+    ],
+)
+def test_what_is_no_environment_is_refused(algorithm, env, remedy):
+    with pytest.raises(ValueError, match=f"The value of `env` is .*, but must be .*{remedy}"):
+        algorithm("MlpPolicy", env, **SMALL)
+
+
+def test_load_and_set_env_take_the_name_of_an_environment(tmp_path):
+    model = make_model(seed=0)
+    model.save(tmp_path / "model")
+    loaded = CGP.load(tmp_path / "model", env="Pendulum-v1")
+    assert loaded.get_env().get_attr("spec")[0].id == "Pendulum-v1"
+    before = loaded.get_env()
+    loaded.set_env("Pendulum-v1")
+    assert loaded.get_env() is not before
+    loaded.learn(60)
+    with pytest.raises(ValueError, match="The value of `env` is 3"):
+        loaded.set_env(3)
+
+
+def test_a_policy_for_dict_observations_is_refused_where_there_are_none():
+    with pytest.raises(ValueError, match="`policy` is 'MultiInputPolicy', but must be 'MlpPolicy', or 'CnnPolicy' for images"):
+        CGP("MultiInputPolicy", "Pendulum-v1", **SMALL)
+
+
+@pytest.mark.parametrize("other", [TD3, SAC])
+def test_a_model_of_another_algorithm_is_refused_with_the_remedy(other, tmp_path):
+    other("MlpPolicy", "Pendulum-v1", **SMALL).save(tmp_path / "model")
+    with pytest.raises(ValueError, match="another algorithm's model is loaded by that algorithm"):
+        CGP.load(tmp_path / "model")
