@@ -1,9 +1,16 @@
-"""What a resumed training shows its user: the step at which it goes on, and a progress bar of the whole."""
+"""What a resumed training shows its user: the step at which it goes on, a progress bar of the whole, and the command."""
+
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 
 from sb3_cgp import CGP, TrainingCheckpointCallback
+from sb3_cgp.zoo.run_folders import interpreter
 
 TINY = dict(learning_starts=5, batch_size=4, buffer_size=200, policy_kwargs=dict(net_arch=[4]), device="cpu")
 
@@ -64,3 +71,19 @@ def test_the_step_of_the_resumption_is_printed_with_verbose(verbose, tmp_path, c
     capsys.readouterr()
     CGP.resume(folder, "Pendulum-v1")
     assert (f"Resuming the training in {folder} at step 20\n" in capsys.readouterr().out) == bool(verbose)
+
+
+@pytest.mark.parametrize("has_path", [True, False])
+def test_the_command_that_continues_a_run_starts_this_interpreter(has_path, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent) if has_path else "/nowhere")
+    command = shlex.split(interpreter())
+    assert (command == ["python"]) == has_path
+    printed = subprocess.run([*command, "-c", "import sys; print(sys.prefix)"], capture_output=True, text=True, check=True)
+    assert printed.stdout.strip() == sys.prefix
+
+
+def test_an_interpreter_below_the_working_directory_is_named_by_a_relative_path(monkeypatch):
+    monkeypatch.setenv("PATH", "/nowhere")
+    monkeypatch.chdir(Path(sys.executable).parent.parent)
+    assert interpreter() == os.path.join("bin", Path(sys.executable).name)

@@ -21,7 +21,7 @@ from sb3_cgp.resumption.logs import cut_monitors
 from sb3_cgp.resumption.store import StateStore
 from sb3_cgp.zoo import registration as zoo
 from sb3_cgp.zoo.resume import main
-from sb3_cgp.zoo.run_folders import LOCK_FILE
+from sb3_cgp.zoo.run_folders import LOCK_FILE, interpreter
 
 EPISODE = 200
 CHECKPOINT = "{'sb3_cgp.TrainingCheckpointCallback': dict(save_freq=250)}"
@@ -276,7 +276,8 @@ def test_a_run_that_was_interrupted_says_how_it_is_continued_and_is_free(error, 
     with pytest.raises(error) if error is not KeyboardInterrupt else nullcontext():
         start(monkeypatch, arguments)
     second = run.with_name("Pendulum-v1_2")
-    advice = f"interrupted at step 330 of 400. Continue it, from step 250, by\n  python -m sb3_cgp.zoo.resume {second}\n"
+    command_line = f"{interpreter()} -m sb3_cgp.zoo.resume {second}"
+    advice = f"interrupted at step 330 of 400. Continue it, from step 250, by\n  {command_line}\n"
     assert advice in capsys.readouterr().out
     monkeypatch.setattr(Stop, "at", None)
     resume(second)

@@ -1,5 +1,9 @@
 """The folder of a run of rl_zoo3, which belongs to one process at a time, and how an interrupted run is continued."""
 
+import os
+import shlex
+import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -55,5 +59,14 @@ def how_to_continue(folder: str | Path, states: str, model: Any, n_timesteps: in
     steps = StateStore(Path(states)).steps()
     if not steps:
         return f"{stopped} It cannot be continued, as no state of it was saved in {states}."
-    command = f"python -m sb3_cgp.zoo.resume {folder}"
+    command = f"{interpreter()} -m sb3_cgp.zoo.resume {shlex.quote(str(folder))}"
     return f"{stopped} Continue it, from step {max(steps):,}, by\n  {command}"
+
+
+def interpreter() -> str:
+    """Return the command that starts this process's interpreter: "python" where the shell finds it, or else its path."""
+    executable, found = Path(sys.executable), shutil.which("python")
+    # By the folder, too, as the interpreter of a virtual environment is a link to one outside of it
+    if found is not None and Path(found).parent == executable.parent and executable.samefile(found):
+        return "python"
+    return shlex.quote(os.path.relpath(executable) if executable.is_relative_to(Path.cwd()) else str(executable))
