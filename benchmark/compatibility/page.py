@@ -28,9 +28,9 @@ env = make_vec_env("PandaReach-v3")
 model = CGP("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer)
 ```
 
-Pass the wrapper as `wrapper_class`. `replayed`, which [repeats an interrupted
-episode](environments.md#simulators-whose-state-cannot-be-read), is in `sb3_cgp.resumption`, `FlattenObservation` in
-`gymnasium.wrappers`. Environments that need other code have it [below](#packages). For others, see [your own
+Pass the table's wrapper as `wrapper_class`: `replayed`, which [repeats an interrupted
+episode](environments.md#simulators-whose-state-cannot-be-read), is in `sb3_cgp.resumption`, and `FlattenObservation` in
+`gymnasium.wrappers`. If an environment needs other code, it is [below](#packages). For all others, see [your own
 environment](environments.md).
 """
 NOTES = """\
