@@ -83,12 +83,11 @@ def test_what_fails_crashes_or_hangs_stays_alone(stand_in, fakes, tmp_path):
     table = rows_of(text)
     assert table["broken: Broken-v0"] == ["MlpPolicy", "not installed", "–", "–", "–", "–"]
     assert table["shaky: sleeps"] == ["MlpPolicy", "no", "–", "–", "–", "–"]
-    assert table["shaky: segfaults"] == ["MlpPolicy", "yes", "bit for bit", "yes (0e+00)", "80 (12,346)", "not tested"]
+    assert table["shaky: segfaults"] == ["MlpPolicy", "yes", "bit for bit", "yes (0e+00)", "80 (12,346)", "–"]
     assert table["shaky: Fine-v0"] == table["shaky: segfaults"]
     assert "- It was not installed: setup.py: swig is missing" in text
     assert "The package contradicts constraints.txt. Other than there: numpy 0.9 (there " in text
-    spaces = "Observations: `Box(3,)`; actions: `Box(1,)`."
-    assert f"- **segfaults**: {spaces} Failed (stops): the process ended by SIGSEGV" in text
+    assert "- **segfaults**: Failed (stops): the process ended by SIGSEGV" in text
     assert str(tmp_path) not in text
 
 

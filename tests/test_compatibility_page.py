@@ -9,7 +9,7 @@ from compatibility_records import WRITTEN, rows_of
 
 from benchmark import environments
 from benchmark.compatibility import check
-from benchmark.compatibility.package_types import Environment, Learning, Package
+from benchmark.compatibility.package_types import Environment, Learning, Package, made
 from benchmark.compatibility.packages import PACKAGES
 from benchmark.compatibility.page import page
 
@@ -46,17 +46,34 @@ def test_a_page_has_returns_successes_and_what_was_noticed(monkeypatch):
     text = page({"works": record})
     cells = ["differs", "yes (0e+00)", "80 (12,346)", "-49.5 → -1.5; 0 → 19 of 20 (3,000 steps)"]
     assert rows_of(text)["works: Works-v0"][2:] == cells
+    assert rows_of(text)["works"] == ['`"works<2"`', "[code](#works)", "works 1.2"]
     for line in (
-        '`pip install "works<2"`',
-        "- Tested: works 1.2, with Python 3.11.7. No version differs from constraints.txt.",
         "- A note.",
-        "- Observations: `Box([...], [...], (2,), float32)`; actions: `Box(1,)`.",
-        "- Not restored: the state of a.Simulator, b.C is unknown "
-        "([what helps](environments.md#environments-of-other-packages)).",
-        "Commit abc, on A processor, 2 cores, load average 3.",
+        "Tested on A processor, 2 cores, with Python 3.11.7. Versions are those of `constraints.txt`, unless the package's "
+        "section says otherwise.",
+        "The machine was busy, so that steps/s are too low, for works.",
         "- Two trainings with one seed differ: the environment does not repeat itself.",
     ):
         assert line in text.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "imports", "section"),
+    [
+        (dict(imported="works"), "`works`", None),
+        (dict(replayed=True), "–", None),
+        (dict(imported="works", arguments="n_envs=2"), "`works`", ['env = make_vec_env("Works-v0", n_envs=2)']),
+    ],
+)
+def test_only_code_with_arguments_of_its_own_is_shown(arguments, imports, section, monkeypatch):
+    package = Package("works", ("works",), ("works",), (Environment("Works-v0", made("Works-v0", **arguments)),))
+    monkeypatch.setattr("benchmark.compatibility.page.PACKAGES", (package,))
+    record = {"installation": {"pins": "all"}, "environments": {}, "versions": {}}
+    text = page({"works": record})
+    assert rows_of(text)["works"][1] == imports
+    _, heading, rest = text.partition("## works\n")
+    assert bool(heading) == bool(section)
+    assert rest.partition("```py\n")[2].partition("\n```")[0].splitlines() == (section or [])
 
 
 def test_the_page_of_the_documentation_is_that_of_the_records():

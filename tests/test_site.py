@@ -16,8 +16,8 @@ import sb3_cgp.zoo
 from sb3_cgp import CGP
 from sb3_cgp.population import Population
 
-# Those whose examples have tests of their own, or belong to the clone
-ELSEWHERE = {"docs/architecture.md", "docs/experiments.md", "docs/population.md"}
+# Those whose examples have tests of their own
+ELSEWHERE = {"docs/architecture.md", "docs/population.md"}
 PAGES = sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))
 WITH_EXAMPLES = [page for page in PAGES if page not in ELSEWHERE and python_examples(page)]
 RESULTS = (ROOT / "benchmark/results/sweeps/results.md").read_text()

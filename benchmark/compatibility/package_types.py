@@ -25,12 +25,12 @@ class Environment:
     An environment, and the arguments of CGP's that it needs.
 
     :param id: its name in the table
-    :param code: Python that assigns it to ``env``; the page shows it
+    :param code: Python that assigns it to ``env``; the page shows it if it has more than the name and a wrapper
     :param policy: the policy's alias
     :param replay_buffer: the name of the replay buffer's class; None for CGP's own
     :param wrappers: what is around the environment, in the table's words
     :param buffer_size: transitions in the check's replay buffer, which are few where they are images
-    :param learning: a training that shows whether CGP learns; None for "not tested"
+    :param learning: a training that shows whether CGP learns; None if that is not tested
     :param notes: sentences on what to know
     """
 

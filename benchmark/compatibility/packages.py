@@ -91,14 +91,10 @@ PACKAGES = (
             Environment(
                 "MountainCarContinuous-v0",
                 made("MountainCarContinuous-v0"),
-                notes=("A first reward is found by action noise that is correlated in time: `hyperparams/cgp.yml` has it.",),
+                notes=("Rewards are found by action noise that is correlated in time (`hyperparams/cgp.yml`).",),
             ),
             Environment("HalfCheetah-v5", made("HalfCheetah-v5")),
-            Environment(
-                "Humanoid-v5",
-                made("Humanoid-v5"),
-                notes=("Observations are float64, and so are the exported policy's inputs.",),
-            ),
+            Environment("Humanoid-v5", made("Humanoid-v5")),
             Environment(
                 "LunarLanderContinuous-v3",
                 made("LunarLanderContinuous-v3", replayed=True),
@@ -109,7 +105,7 @@ PACKAGES = (
                 made("CarRacing-v3"),
                 policy="CnnPolicy",
                 buffer_size=300,
-                notes=("Observations are images: allow for the memory of `buffer_size`, and take a GPU.",),
+                notes=("Observations are images: use a GPU, and a `buffer_size` that fits into the memory.",),
             ),
         ),
     ),
@@ -125,7 +121,6 @@ PACKAGES = (
                 "PointMaze_UMaze-v3",
                 made("PointMaze_UMaze-v3", "gymnasium_robotics", "env_kwargs=dict(max_episode_steps=100)"),
                 **HINDSIGHT,
-                notes=("A maze's robot is an environment within the environment, whose state CGP does not know.",),
             ),
         ),
     ),
@@ -137,7 +132,6 @@ PACKAGES = (
             Environment("PandaReach-v3", made("PandaReach-v3", "panda_gym"), learning=REACH, **HINDSIGHT),
             Environment("PandaPickAndPlace-v3", made("PandaPickAndPlace-v3", "panda_gym"), **HINDSIGHT),
         ),
-        ("Each reset without a seed draws its goal from a new generator, so that two trainings of one seed differ.",),
     ),
     Package(
         "dm_control",
@@ -155,7 +149,6 @@ PACKAGES = (
                 wrappers="`FlattenObservation`",
             ),
         ),
-        ("dm_control 1.0.41 and later need a newer MuJoCo than constraints.txt has.",),
     ),
     Package(
         "metaworld",
@@ -166,7 +159,7 @@ PACKAGES = (
                 "Meta-World/MT1 reach-v3", made("Meta-World/MT1", "metaworld", 'env_kwargs=dict(env_name="reach-v3", seed=0)')
             ),
         ),
-        ("metaworld 3.1 needs MuJoCo 3.3.0: pip takes 3.0 to agree with constraints.txt.",),
+        ("metaworld 3.1 needs MuJoCo 3.3.0. With `-c constraints.txt`, pip installs 3.0.",),
     ),
     Package(
         "gym-pusht",
@@ -190,8 +183,8 @@ PACKAGES = (
                 made("parking-v0", "highway_env", replayed=True),
                 wrappers="`replayed`",
                 notes=(
-                    "Other tasks have discrete actions by default; "
-                    '`env_kwargs=dict(config={"action": {"type": "ContinuousAction"}})` makes them continuous.',
+                    "For tasks with discrete actions, pass "
+                    '`env_kwargs=dict(config={"action": {"type": "ContinuousAction"}})`.',
                 ),
                 **HINDSIGHT,
             ),
@@ -231,7 +224,6 @@ PACKAGES = (
                 wrappers="`GymWrapper`",
             ),
         ),
-        ("robosuite's wrappers import h5py, which pip does not install with it.",),
     ),
     Package(
         "mpe2",
@@ -242,10 +234,7 @@ PACKAGES = (
                 "simple_spread_v3",
                 SUPERSUIT,
                 wrappers="supersuit's, an adapter",
-                notes=(
-                    "The agents share one policy: each is an environment of the vector environment.",
-                    "The adapter seeds the environments and reports time limits: supersuit does neither.",
-                ),
+                notes=("All agents share one policy. The adapter seeds the environments and reports time limits.",),
             ),
         ),
     ),
@@ -258,9 +247,7 @@ PACKAGES = (
                 "Pendulum-v1",
                 ENVPOOL,
                 wrappers="an adapter",
-                notes=(
-                    "The simulator resets an environment by itself; the adapter gives SB3 the last observation of an episode.",
-                ),
+                notes=("The adapter resets environments as SB3 expects, and keeps the last observation of an episode.",),
             ),
         ),
     ),
@@ -273,7 +260,7 @@ PACKAGES = (
                 "gym_aloha/AlohaTransferCube-v0",
                 ALOHA,
                 wrappers="`FilterObservation`, `FlattenObservation`",
-                notes=("SB3 takes no nested `Dict` observations: the policy sees the joints alone.",),
+                notes=("SB3 takes no nested `Dict` observations: the policy observes the joints alone.",),
             ),
         ),
     ),

@@ -1,7 +1,7 @@
 """The page of the tested environments, from the records of the packages."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from statistics import mean
 from typing import Any
 
@@ -10,33 +10,45 @@ from benchmark.compatibility.package_types import Environment, Package
 from benchmark.compatibility.packages import PACKAGES
 
 HEADER = ("environment", "policy, buffer, wrappers", "trains", "resumes", "exports", "steps/s", "learns")
+PACKAGE_HEADER = ("package", "`pip install`", "import", "tested versions")
 TOP = """\
 # Tested environments
 
-CGP trains on the environments of these packages from PyPI. Make an environment by the code of its package's section, and
-pass it to `CGP(policy, env)`, with the policy and the `replay_buffer_class` that the table names. For an environment that is
-not in the table, see [your own environment](environments.md).
+CGP trains on the environments of these packages from PyPI. Import the package, make the environment by its name, and pass it
+to CGP with the policy and the replay buffer of the table:
+
+```py
+import panda_gym
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_cgp import CGP
+
+env = make_vec_env("PandaReach-v3")
+model = CGP("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer)
+```
+
+Pass the table's wrapper as `wrapper_class`: `replayed`, which [repeats an interrupted
+episode](environments.md#simulators-whose-state-cannot-be-read), is in `sb3_cgp.resumption`, and `FlattenObservation` in
+`gymnasium.wrappers`. If an environment needs other code, it is [below](#packages). For all others, see [your own
+environment](environments.md).
 """
 NOTES = """\
-- **trains**: CGP was trained for 220 steps, 110 of them random, with its default networks and batch size and a small replay
-  buffer. The model then predicted actions within the bounds, was saved, and predicted the same when it was loaded.
-- **resumes**: a training that was stopped after step 163, and resumed by another process, was compared with one that was not
-  stopped. "bit for bit": both end with identical networks, optimizers, replay buffer and counters. "from a new episode": the
-  environment's state cannot be restored, so that the resumed training begins a new episode, and a warning says so.
-  "differs": the trainings differ without a warning. `replayed` restores an environment by [repeating the interrupted
-  episode](environments.md#simulators-whose-state-cannot-be-read); without it, the training is resumed from a new episode.
-- **exports**: `model.export` worked. In brackets: the largest difference between the actions of `predict` and those of the
-  exported policy, as a share of the action space's width.
-- **steps/s**: environment steps per second of processor time, on one thread, with one gradient step per step. In brackets:
-  the environment alone, with random actions. Where the load average of a section exceeds the number of cores, both are too
-  low.
-- **learns**: the mean return of 20 episodes, first by random actions, then by the actor after a training of that many steps;
-  and how many of the episodes were successful, where the environment reports it. The arguments are in
-  `benchmark/compatibility/packages.py`.
-- "–": not checked, or the check was interrupted. A "+" after a commit: files differed from it.
-
-`make test-environments` installs each package into a virtual environment of its own, repeats the checks, and writes the
-records and this page to `results/environments/environments.md`.
+- **trains**: CGP trained for 220 steps, was saved and loaded, and acted as before, within the bounds.
+- **resumes**: an interrupted training was compared with an uninterrupted one. "bit for bit": networks, optimizers, replay
+  buffer and counters are identical at the end. "from a new episode": the state of the environment cannot be restored, and a
+  warning names its classes ([what helps](environments.md#environments-of-other-packages)). "differs": without a warning.
+- **exports**: in brackets, the largest difference between the actions of `predict` and of the exported policy, as a share of
+  the action space's width. Where observations are float64, so are the exported policy's inputs.
+- **steps/s**: steps per second of processor time, on one thread, with a gradient step after each. In brackets: the environment
+  alone.
+- **learns**: the mean return of 20 episodes, and how many are successful: by random actions → after a training of that many
+  steps (arguments: `benchmark/compatibility/packages.py`).
+- "–": not tested, or interrupted.
+"""
+REPEAT = """\
+`make test-environments` tests each package in a virtual environment of its own, and writes the records and this page to
+`results/environments/environments.md`. This repository's records are in `benchmark/results/environments`.
 """
 NEXT = "Next: [your own environment](environments.md), [stop and resume](resuming.md), [on a robot](robot.md).\n"
 UNKNOWN = "–"
@@ -60,7 +72,12 @@ def page(records: Mapping[str, dict[str, Any]]) -> str:
             "",
             NOTES,
             *([f"Not tested yet: {', '.join(missing)}.\n"] if missing else []),
-            *sections,
+            "## Packages\n",
+            markdown_table(PACKAGE_HEADER, [_package(package, records[package.name]) for package in known], align="left"),
+            "",
+            *_conditions([records[package.name] for package in known]),
+            REPEAT,
+            *filter(None, sections),
             NEXT,
         ]
     )
@@ -105,51 +122,66 @@ def _speed(found: dict[str, Any]) -> str:
 
 def _learns(environment: Environment, found: dict[str, Any]) -> str:
     """Return the returns of random actions and of the actor."""
-    if environment.learning is None:
-        return "not tested"
-    if found.get("returns") is None:
+    if environment.learning is None or found.get("returns") is None:
         return UNKNOWN
     random, actor = (f"{mean(found[key]):.1f}" for key in ("random_returns", "returns"))
     successes = "" if found["successes"] is None else f"; {found['random_successes']} → {found['successes']} of 20"
     return f"{random} → {actor}{successes} ({environment.learning.steps:,} steps)"
 
 
+def _package(package: Package, record: dict[str, Any]) -> list[str]:
+    """Return a package's row: what pip installs, the import that registers the environments, and the versions."""
+    requirements = f"`{' '.join(map(_quoted, package.requirements))}`"
+    if any(_code(environment) == environment.code for environment in package.environments):
+        imported = f"[code](#{package.name})"
+    else:
+        imported = ", ".join(f"`{name}`" for name in re.findall(r"^import (\w+)$", package.environments[0].code, re.MULTILINE))
+    versions = ", ".join(f"{name} {record['versions'].get(name, 'missing')}" for name in package.distributions)
+    tested = "not installed" if "failure" in record["installation"] else versions if record["environments"] else UNKNOWN
+    return [package.name, requirements, imported or UNKNOWN, tested]
+
+
 def _section(package: Package, record: dict[str, Any]) -> str:
-    """Return the section of a package."""
-    lines = [f"## {package.name}", "", f"`pip install {' '.join(map(_quoted, package.requirements))}`", ""]
-    lines += ["```py", _code(package), "```", ""]
+    """Return the section of a package: code other than the usual, and what to know; empty if there is neither."""
+    code = "\n\n\n".join(filter(None, map(_code, package.environments)))
     installation = record["installation"]
+    lines = []
     if "failure" in installation:
-        lines.append(f"- It was not installed: {installation['failure']}")
-    elif record["environments"]:
-        versions = ", ".join(f"{name} {record['versions'].get(name, 'missing')}" for name in package.distributions)
-        lines.append(f"- Tested: {versions}, with Python {record['python']}. {_pins(record)}")
-    lines += [f"- {note}" for note in package.notes]
+        lines.append(f"It was not installed: {installation['failure']}")
+    elif record["environments"] and installation["pins"] != "all":
+        lines.append(_pins(record))
+    lines += package.notes
+    # A fact that several environments share is stated once
+    facts: dict[str, list[str]] = {}
     for environment in package.environments:
-        facts = [*environment.notes, *_facts(record["environments"].get(environment.id, {}))]
-        if len(package.environments) > 1 and facts:
-            facts = [f"**{environment.id}**: {' '.join(facts)}"]
-        lines += [f"- {fact}" for fact in facts]
-    lines += ["", _conditions(record)]
-    return "\n".join(lines) + "\n"
+        for fact in (*environment.notes, *_facts(record["environments"].get(environment.id, {}))):
+            facts.setdefault(fact, []).append(environment.id)
+    for fact, ids in facts.items():
+        lines.append(fact if len(ids) == len(package.environments) else f"**{', '.join(ids)}**: {fact}")
+    parts = [*([f"```py\n{code}\n```\n"] if code else []), *(["".join(f"- {line}\n" for line in lines)] if lines else [])]
+    return "\n".join([f"## {package.name}\n", *parts]) if parts else ""
 
 
-def _code(package: Package) -> str:
-    """Return the code that makes the package's environments: if each takes one line, all imports, and then these lines."""
-    parts = [environment.code.rpartition("\n\n") for environment in package.environments]
-    if len(parts) == 1 or any("\n" in last for _, _, last in parts):
-        return "\n\n\n".join(environment.code for environment in package.environments)
-    imports = dict.fromkeys(line for first, _, _ in parts for line in first.splitlines() if line)
-    # As isort has them: the project's own imports are a block of their own
-    own = [line for line in imports if line.startswith("from sb3_cgp")]
-    others = sorted((line for line in imports if line not in own), key=lambda line: (line.startswith("from"), line))
-    return "\n".join([*others, *([""] if own else []), *own, "", *(last for _, _, last in parts)])
+def _code(environment: Environment) -> str:
+    """Return the code that makes an environment, without what is said for all: imports, and the name and wrapper alone."""
+    found = re.fullmatch(r'(?:(?:import|from) .+\n|\n)*(env = make_vec_env\("[^"]+"(.*)\))', environment.code)
+    if found is None:
+        return environment.code
+    return "" if re.fullmatch(r"(, wrapper_class=\w+)?", found[2]) else found[1]
 
 
-def _conditions(record: dict[str, Any]) -> str:
-    """Return where the package was tested."""
-    load = "" if record.get("load_average") is None else f", load average {record['load_average']:.0f}"
-    return f"Commit {record['commit']}, on {record['machine']['cpu']}, {record['machine']['cores']} cores{load}."
+def _conditions(records: Sequence[dict[str, Any]]) -> list[str]:
+    """Return where the packages were tested, and which speeds are too low."""
+    tested = [record for record in records if record["environments"]]
+    if not tested:
+        return []
+    machines = dict.fromkeys(
+        f"{record['machine']['cpu']}, {record['machine']['cores']} cores, with Python {record['python']}" for record in tested
+    )
+    busy = [record["package"] for record in tested if (record.get("load_average") or 0) > record["machine"]["cores"]]
+    low = f"The machine was busy, so that steps/s are too low, for {', '.join(busy)}.\n" if busy else ""
+    pins = "Versions are those of `constraints.txt`, unless the package's section says otherwise."
+    return [f"Tested on {'; '.join(machines)}. {pins}\n{low}"]
 
 
 def _quoted(requirement: str) -> str:
@@ -158,9 +190,7 @@ def _quoted(requirement: str) -> str:
 
 
 def _pins(record: dict[str, Any]) -> str:
-    """Return how the versions compare with those of ``constraints.txt``."""
-    if record["installation"]["pins"] == "all":
-        return "No version differs from constraints.txt."
+    """Return which versions are not those of ``constraints.txt``."""
     others = ", ".join(f"{name} {found} (there {pinned})" for name, (found, pinned) in record["other_versions"].items())
     return f"The package contradicts constraints.txt. Other than there: {others or 'nothing'}."
 
@@ -168,26 +198,8 @@ def _pins(record: dict[str, Any]) -> str:
 def _facts(found: dict[str, Any]) -> list[str]:
     """Return what was noticed in the check, as sentences."""
     facts = []
-    if "observations" in found:
-        observations, actions = (_space(found[key]) for key in ("observations", "actions"))
-        facts.append(f"Observations: `{observations}`; actions: `{actions}`.")
     if found.get("repeats") is False:
         facts.append("Two trainings with one seed differ: the environment does not repeat itself.")
-    if found.get("why_not_restorable") is not None:
-        facts.append(f"Not restored: {_reason(found['why_not_restorable'])}")
     for errors in found.get("errors", {}).values():
         facts += [f"Failed ({step}): {error}" for step, error in errors.items()]
     return facts
-
-
-def _space(text: str) -> str:
-    """Return the description of a space without the arrays of its bounds."""
-    return re.sub(r"\[[^][]*\]", "[...]", text)
-
-
-def _reason(text: str) -> str:
-    """Return why an environment is not restored, in fewer words where classes are unknown."""
-    unknown = re.findall(r"([\w.]+) is unknown and has no get_training_state\(\)", text)
-    if not unknown:
-        return text
-    return f"the state of {', '.join(unknown)} is unknown ([what helps](environments.md#environments-of-other-packages))."
