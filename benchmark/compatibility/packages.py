@@ -8,6 +8,8 @@ HINDSIGHT: dict[str, Any] = dict(policy="MultiInputPolicy", replay_buffer="HerRe
 # As `hyperparams/cgp.yml` has them
 SMALL: dict[str, Any] = dict(learning_starts=1_000, buffer_size=10_000, policy_kwargs=dict(net_arch=[64, 64]))
 PENDULUM = Learning(5_000, dict(learning_rate=2e-3, batch_size=64, gamma=0.98, tau=0.02, **SMALL))
+# The defaults, but for smaller networks and fewer random steps
+DEFAULTS = Learning(20_000, SMALL | dict(buffer_size=20_000))
 REACH = Learning(3_000, dict(batch_size=256, gamma=0.95, **SMALL), normalize=True)
 # envpool's environments are no environments of SB3's
 ENVPOOL = """\
@@ -93,12 +95,13 @@ PACKAGES = (
                 made("MountainCarContinuous-v0"),
                 notes=("Rewards are found by action noise that is correlated in time (`hyperparams/cgp.yml`).",),
             ),
-            Environment("HalfCheetah-v5", made("HalfCheetah-v5")),
+            Environment("HalfCheetah-v5", made("HalfCheetah-v5"), learning=DEFAULTS),
             Environment("Humanoid-v5", made("Humanoid-v5")),
             Environment(
                 "LunarLanderContinuous-v3",
                 made("LunarLanderContinuous-v3", replayed=True),
                 wrappers="`replayed`",
+                learning=DEFAULTS,
             ),
             Environment(
                 "CarRacing-v3",
@@ -120,6 +123,7 @@ PACKAGES = (
             Environment(
                 "PointMaze_UMaze-v3",
                 made("PointMaze_UMaze-v3", "gymnasium_robotics", "env_kwargs=dict(max_episode_steps=100)"),
+                learning=DEFAULTS,
                 **HINDSIGHT,
             ),
         ),
@@ -139,7 +143,10 @@ PACKAGES = (
         ("dm-control", "shimmy", "mujoco"),
         (
             Environment(
-                "dm_control/cartpole-swingup-v0", made("dm_control/cartpole-swingup-v0", "shimmy"), policy="MultiInputPolicy"
+                "dm_control/cartpole-swingup-v0",
+                made("dm_control/cartpole-swingup-v0", "shimmy"),
+                policy="MultiInputPolicy",
+                learning=DEFAULTS,
             ),
             Environment(
                 "dm_control/walker-walk-v0",
@@ -147,6 +154,7 @@ PACKAGES = (
                 "from stable_baselines3.common.env_util import make_vec_env\n\n"
                 'env = make_vec_env("dm_control/walker-walk-v0", wrapper_class=FlattenObservation)',
                 wrappers="`FlattenObservation`",
+                learning=DEFAULTS,
             ),
         ),
     ),
@@ -156,7 +164,9 @@ PACKAGES = (
         ("metaworld", "mujoco"),
         (
             Environment(
-                "Meta-World/MT1 reach-v3", made("Meta-World/MT1", "metaworld", 'env_kwargs=dict(env_name="reach-v3", seed=0)')
+                "Meta-World/MT1 reach-v3",
+                made("Meta-World/MT1", "metaworld", 'env_kwargs=dict(env_name="reach-v3", seed=0)'),
+                learning=DEFAULTS,
             ),
         ),
         ("metaworld 3.1 needs MuJoCo 3.3.0. With `-c constraints.txt`, pip installs 3.0.",),
@@ -170,6 +180,7 @@ PACKAGES = (
                 "gym_pusht/PushT-v0",
                 made("gym_pusht/PushT-v0", "gym_pusht", 'env_kwargs=dict(obs_type="state")', replayed=True),
                 wrappers="`replayed`",
+                learning=DEFAULTS,
             ),
         ),
     ),
@@ -182,6 +193,7 @@ PACKAGES = (
                 "parking-v0",
                 made("parking-v0", "highway_env", replayed=True),
                 wrappers="`replayed`",
+                learning=DEFAULTS,
                 notes=(
                     "For tasks with discrete actions, pass "
                     '`env_kwargs=dict(config={"action": {"type": "ContinuousAction"}})`.',
@@ -199,11 +211,13 @@ PACKAGES = (
                 "InvertedPendulumBulletEnv-v0",
                 made("InvertedPendulumBulletEnv-v0", "pybullet_envs_gymnasium", replayed=True),
                 wrappers="`replayed`",
+                learning=DEFAULTS,
             ),
             Environment(
                 "HalfCheetahBulletEnv-v0",
                 made("HalfCheetahBulletEnv-v0", "pybullet_envs_gymnasium", replayed=True),
                 wrappers="`replayed`",
+                learning=DEFAULTS,
             ),
         ),
     ),
@@ -234,6 +248,7 @@ PACKAGES = (
                 "simple_spread_v3",
                 SUPERSUIT,
                 wrappers="supersuit's, an adapter",
+                learning=DEFAULTS,
                 notes=("All agents share one policy. The adapter seeds the environments and reports time limits.",),
             ),
         ),
@@ -247,6 +262,7 @@ PACKAGES = (
                 "Pendulum-v1",
                 ENVPOOL,
                 wrappers="an adapter",
+                learning=PENDULUM,
                 notes=("The adapter resets environments as SB3 expects, and keeps the last observation of an episode.",),
             ),
         ),
