@@ -1,10 +1,10 @@
 """
-Do, on a GPU that is there for a short time, what is worth most first: the tests that need one, the speed of populations, and
-the paper's sweeps as populations.
+Run a list of measurements on a GPU that is available for a short time: the tests that need one, the speed of populations, and
+the paper's sweeps as populations, the most valuable first.
 
-``python -m benchmark.gpu_list --minutes 9`` ends within nine minutes. The same command continues: steps that are done are
-skipped unless their command has changed, and a stopped one goes on from what it has written; a test file, which cannot, begins
-anew. ``--rehearse`` does all of it on the CPU, with tiny sizes, in a folder of its own.
+``python -m benchmark.gpu_list --minutes 9`` ends within nine minutes, and the same command continues. A completed step is
+skipped unless its command has changed; a stopped one continues from its files, and a stopped test file starts again.
+``--rehearse`` runs all steps on the CPU, with tiny settings, in a folder of its own.
 """
 
 import argparse
@@ -46,17 +46,20 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     :return: the parsed arguments
     """
     parser = argparse.ArgumentParser(
-        prog="python -m benchmark.gpu_list", description="Do what is worth most on a GPU that is there for a short time."
+        prog="python -m benchmark.gpu_list",
+        description="Run the tests that need a GPU, the measurement of populations and sweeps, within the time of a GPU.",
     )
     parser.add_argument("--minutes", type=float, help="end within this time (default: no limit)")
     parser.add_argument("--steps", type=count, default=300_000, help="environment steps of each run (default: %(default)s)")
     parser.add_argument("--population", type=count, default=32, help="runs of one population, at most (default: %(default)s)")
     parser.add_argument("--workers", type=count, default=1, help="processes of each sweep (default: %(default)s)")
     parser.add_argument("--folder", type=output_folder, default="results/gpu_list", help="folder (default: %(default)s)")
-    parser.add_argument("--only", nargs="+", help="names of steps to do (default: all)")
-    parser.add_argument("--retry", action="store_true", help="do steps again that have failed")
-    parser.add_argument("--rehearse", action="store_true", help="do all of it on the CPU, tiny, in --folder/rehearsal")
-    parser.add_argument("--list", action="store_true", help="print the steps and their states, and do nothing")
+    parser.add_argument("--only", nargs="+", help="names of steps to run (default: all)")
+    parser.add_argument("--retry", action="store_true", help="repeat failed steps")
+    parser.add_argument(
+        "--rehearse", action="store_true", help="run all steps on the CPU, with tiny settings, in --folder/rehearsal"
+    )
+    parser.add_argument("--list", action="store_true", help="print the steps and their states")
     add_epilog(
         parser,
         "examples:\n  python -m benchmark.gpu_list --minutes 9\n  python -m benchmark.gpu_list --rehearse",
