@@ -40,11 +40,13 @@ DIST_INSTALLED := $(STAMP)dist
 # An editable install holds copies of the version and of the start-up hook.
 REQUIREMENTS := setup.cfg setup.py pyproject.toml $(CONSTRAINTS) _build_backend.py sb3_cgp/version.txt
 
-# A misspelt variable would have no effect
+# A misspelt variable would have no effect. Within another make, variables may be those of the outer one.
 KNOWN := ALGO ENV SEED STEPS EVAL_FREQ EVAL_EPISODES THREADS LOGS PARAMS ARGS RUN PACKAGES PYTHON VENV CONSTRAINTS TAG ADDRESS
-UNKNOWN := $(filter-out $(KNOWN) MAKE% SHELL,$(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name))))
-ifneq ($(UNKNOWN),)
-$(error There is no variable $(UNKNOWN), but: $(KNOWN))
+OTHERS := IN_VENV PYTEST PYTEST_% PIP_% PYTHON% CUDA_% OMP_% MKL_% MUJOCO_% MAKE% GNUMAKE% MFLAGS SHELL .%
+GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command,$(origin $(name))),$(name)))
+UNKNOWN := $(filter-out $(KNOWN) $(OTHERS),$(GIVEN))
+ifneq ($(and $(filter 0,$(MAKELEVEL)),$(UNKNOWN)),)
+$(error There is no variable $(UNKNOWN), but: $(KNOWN). Set variables of other programs before make: $(firstword $(UNKNOWN))=... make)
 endif
 
 .DEFAULT_GOAL := help

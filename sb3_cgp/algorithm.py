@@ -22,6 +22,7 @@ from sb3_cgp.fast.replay import LeanReplayAlgorithm
 from sb3_cgp.fast.scoring import SCORING_DTYPES
 from sb3_cgp.guards.algorithm import GuardedAlgorithm
 from sb3_cgp.guards.arguments import check_callback
+from sb3_cgp.guards.construction import checks_arguments
 from sb3_cgp.guards.losses import LossGuard
 from sb3_cgp.guards.names import suggests_names
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
@@ -120,7 +121,7 @@ class CGP(
         "MultiInputPolicy": MultiInputPolicy,
     }
 
-    @suggests_names
+    @checks_arguments
     def __init__(
         self,
         policy: str | type[CGPPolicy],

@@ -3,6 +3,8 @@
 import inspect
 import re
 from pathlib import Path
+from types import MappingProxyType
+from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -11,17 +13,28 @@ import torch as th
 from guarded import SMALL, GuardedTD3
 from small_models import make_model
 from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_cgp import CGP
 from sb3_cgp.common.sb3_arguments import constructor_argument_names
 from sb3_cgp.core.policies import CGPPolicy
+from sb3_cgp.fast.policies import MlpPolicy
+from sb3_cgp.guards import GuardedAlgorithm
 from sb3_cgp.population import Population
 
 POLICY_ARGUMENTS = ["net_arch", "n_critics", "activation_fn", "optimizer_class", "features_extractor_class", "selector"]
 
 
-def make(**arguments):
-    return CGP("MlpPolicy", "Pendulum-v1", **SMALL | arguments)
+def make(policy="MlpPolicy", env="Pendulum-v1", algorithm=CGP, **arguments):
+    return algorithm(policy, env, **SMALL | arguments)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    path = tmp_path_factory.mktemp("saved") / "model"
+    make().save(path)
+    return path
 
 
 @pytest.mark.parametrize(
@@ -37,6 +50,33 @@ def test_a_misspelt_argument_of_the_constructor_is_refused_with_the_nearest_one(
     message = rf"The value of `{given}` is 3, but `CGP` takes no such argument\. Did you mean `{similar}`\?"
     with pytest.raises(TypeError, match=message):
         make(**{given: 3})
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"),
+    [
+        ("total_timesteps", "Give it to `learn`"),
+        ("n_timesteps", "Give `total_timesteps` to `learn`"),
+        ("n_envs", "Give it to SB3's `make_vec_env`"),
+        ("eval_freq", "Give SB3's `EvalCallback`"),
+        ("n_sampled_goal", "Give it in `replay_buffer_kwargs`"),
+        ("gradient_clip", "gradients are not clipped"),
+        ("n_epochs", "It takes action_noise"),
+    ],
+)
+def test_an_argument_that_belongs_elsewhere_is_sent_there(name, remedy):
+    with pytest.raises(TypeError, match=f"`CGP` takes no such argument. .*{remedy}"):
+        make(**{name: 3})
+
+
+def test_the_first_of_several_unknown_arguments_is_named():
+    with pytest.raises(TypeError, match="The value of `netarch` is 1"):
+        make(netarch=1, foo=2, bar=3)
+
+
+def test_an_argument_of_the_constructor_is_sent_there_by_learn():
+    with pytest.raises(TypeError, match=r"`CGP.learn` takes no such argument\. Give it to the constructor\."):
+        make().learn(5, batch_size=3)
 
 
 def test_an_argument_similar_to_none_is_refused_with_all_names():
@@ -58,9 +98,9 @@ def own_arguments(other):
 
 @pytest.mark.parametrize("other", [TD3, SAC])
 def test_every_argument_that_only_another_algorithm_has_gets_a_remedy(other):
-    for name in own_arguments(other):
-        if name in constructor_argument_names(GuardedTD3):
-            continue
+    # `support_multi_env` and its like, which SB3's algorithms give to their base class
+    internal = constructor_argument_names(OffPolicyAlgorithm) - {"use_sde", "sde_sample_freq", "use_sde_at_warmup"}
+    for name in set(own_arguments(other)) - internal:
         with pytest.raises(TypeError, match=r"`CGP` takes no such argument\. Leave it out: "):
             make(**{name: 1})
 
@@ -106,20 +146,36 @@ def test_an_unknown_argument_of_the_policy_is_refused_with_a_remedy(arguments, m
         make(policy_kwargs=arguments)
 
 
-class PoppingPolicy(CGP.policy_aliases["MlpPolicy"]):
-    """Takes an argument that no signature names."""
+class OwnForms(MlpPolicy):
+    """Takes an argument that no signature names, and a name in the place of `net_arch`."""
 
-    def __init__(self, *args, **kwargs):
+    def __init__(self, *args, net_arch="small", **kwargs):
         self.hidden_argument = kwargs.pop("hidden_argument")
-        super().__init__(*args, **kwargs)
+        super().__init__(*args, net_arch={"small": [4]}.get(net_arch, net_arch), **kwargs)
 
 
-def test_an_argument_that_no_signature_of_a_users_policy_names_is_passed_on():
-    model = CGP(PoppingPolicy, "Pendulum-v1", **SMALL | dict(policy_kwargs=dict(net_arch=[4], hidden_argument=7)))
+def test_a_users_policy_may_take_arguments_of_other_names_and_forms(tmp_path):
+    model = make(OwnForms, policy_kwargs=dict(net_arch="small", hidden_argument=7))
     assert model.policy.hidden_argument == 7
+    model.save(tmp_path / "model")
+    assert CGP.load(tmp_path / "model").policy.hidden_argument == 7
 
 
-class FailingPolicy(CGP.policy_aliases["MlpPolicy"]):
+class Extractor(FlattenExtractor):
+    """Takes no argument of the name that the policy takes."""
+
+    def __init__(self, observation_space, width=3):
+        super().__init__(observation_space)
+
+
+def test_an_unknown_argument_of_a_features_extractor_is_not_taken_for_the_policys():
+    arguments = dict(activation_fn=th.nn.ReLU)
+    given = dict(net_arch=[4], features_extractor_class=Extractor, features_extractor_kwargs=arguments, **arguments)
+    with pytest.raises(TypeError, match=r"Extractor.__init__\(\) got an unexpected keyword argument 'activation_fn'"):
+        make(policy_kwargs=given)
+
+
+class FailingPolicy(MlpPolicy):
     """Calls a function of its own by a wrong name."""
 
     def __init__(self, *args, **kwargs):
@@ -133,27 +189,29 @@ def test_an_error_of_a_users_policy_itself_is_not_replaced():
 
 
 WRONG_VALUES = [
-    ("verbose", "1", "an integer: 0 for no output"),
+    ("verbose", "1", "0 for no output"),
     ("policy_kwargs", [8], "None or a dictionary, such as dict(net_arch=[64, 64])"),
-    ("stats_window_size", "3", "an integer >= 1"),
-    ("stats_window_size", 0, "an integer >= 1"),
+    ("stats_window_size", "3", "an int >= 0, or None"),
+    ("stats_window_size", np.int64(3), "an int >= 0, or None"),
     ("tensorboard_log", 3, "None or the path of a folder"),
     ("seed", "a", "None or an integer within [0, 2**32)"),
     ("seed", -1, "None or an integer within [0, 2**32)"),
-    ("device", "gpu", "'auto', a device of PyTorch's"),
+    ("device", "gpu", "'auto', or a device that PyTorch can use here"),
+    ("device", "xpu", "'auto', or a device that PyTorch can use here"),
     ("replay_buffer_kwargs", [1], "None or a dictionary"),
     ("replay_buffer_class", "HerReplayBuffer", "None or a class of replay buffers"),
-    ("replay_buffer_class", dict, "None or a class of replay buffers"),
     ("optimize_memory_usage", "no", "True or False"),
 ]
 
 
-@pytest.mark.parametrize("algorithm", [CGP, GuardedTD3])
 @pytest.mark.parametrize(("name", "value", "allowed"), WRONG_VALUES)
-def test_a_wrong_argument_is_refused_by_name_before_sb3_uses_it(algorithm, name, value, allowed):
+def test_a_wrong_argument_is_refused_by_name_before_sb3_uses_it(name, value, allowed, saved):
     message = re.escape(f"The value of `{name}` is {value!r}, but must be {allowed}")
     with pytest.raises(ValueError, match=message):
-        algorithm("MlpPolicy", "Pendulum-v1", **SMALL | {name: value})
+        make(**{name: value})
+    if name != "policy_kwargs":
+        with pytest.raises(ValueError, match=message):
+            CGP.load(saved, **{name: value})
 
 
 @pytest.mark.parametrize("name", ["verbose", "stats_window_size", "seed"])
@@ -169,11 +227,21 @@ def test_a_population_refuses_the_same_arguments(name):
         dict(seed=np.int64(3)),
         dict(tensorboard_log=Path("somewhere")),
         dict(device=th.device("cpu")),
-        dict(policy_kwargs=None),
+        dict(policy_kwargs=MappingProxyType(dict(net_arch=[4]))),
+        dict(optimize_memory_usage=0),
+        dict(stats_window_size=None),
     ],
 )
-def test_equivalent_values_are_taken(arguments):
-    make(**arguments)
+def test_equivalent_values_are_taken(arguments, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    make(**arguments | dict(learning_starts=4)).learn(6)
+
+
+def test_seeds_of_numpy_are_those_of_python(saved):
+    firsts = [make(seed=seed, learning_starts=4).learn(6).predict(np.ones(3))[0] for seed in (3, np.int64(3))]
+    assert firsts[0] == firsts[1]
+    CGP.load(saved, env="Pendulum-v1", seed=np.int64(3)).set_random_seed(np.int64(4))
+    Population("MlpPolicy", "Pendulum-v1", 2, **SMALL | dict(seed=np.int64(3), learning_starts=2)).learn(8)
 
 
 @pytest.mark.parametrize(
@@ -189,7 +257,7 @@ def test_equivalent_values_are_taken(arguments):
         ("net_arch", "64", "None, a list of integers >= 1"),
         ("net_arch", [64.0], "None, a list of integers >= 1"),
         ("net_arch", dict(pi=[4]), "None, a list of integers >= 1"),
-        ("net_arch", dict(pi=[4], vf=[4]), "None, a list of integers >= 1"),
+        ("net_arch", (4, 4), "None, a list of integers >= 1"),
     ],
 )
 def test_a_wrong_argument_of_the_policy_is_refused_by_name(name, value, allowed):
@@ -203,6 +271,8 @@ def test_a_wrong_argument_of_the_policy_is_refused_by_name(name, value, allowed)
     [
         dict(net_arch=[]),
         dict(net_arch=dict(pi=[4], qf=[])),
+        dict(net_arch=dict(pi=(4,), qf=(np.int64(4),))),
+        dict(net_arch=dict(pi=[4], qf=[4], vf=[4])),
         dict(activation_fn=lambda: th.nn.LeakyReLU(0.1)),
         dict(optimizer_class=th.optim.SGD, optimizer_kwargs=dict(momentum=0.9)),
     ],
@@ -219,6 +289,7 @@ def test_valid_arguments_of_the_policy_are_taken(arguments):
         (3, "the name of a registered environment"),
         ([gym.make], "the name of a registered environment"),
         (gym.Wrapper, re.escape("write `Wrapper(...)`, with its arguments")),
+        (gym.make_vec("Pendulum-v1", num_envs=2), re.escape("which SB3's `make_vec_env(name, n_envs=N)` makes")),
     ],
 )
 def test_what_is_no_environment_is_refused(algorithm, env, remedy):
@@ -241,11 +312,52 @@ def test_load_and_set_env_take_the_name_of_an_environment(tmp_path):
 
 def test_a_policy_for_dict_observations_is_refused_where_there_are_none():
     with pytest.raises(ValueError, match="`policy` is 'MultiInputPolicy', but must be 'MlpPolicy', or 'CnnPolicy' for images"):
-        CGP("MultiInputPolicy", "Pendulum-v1", **SMALL)
+        make("MultiInputPolicy")
+
+
+class OnePolicy(CGP):
+    """Has one class of policies under both names."""
+
+    policy_aliases: ClassVar = {"MlpPolicy": MlpPolicy, "MultiInputPolicy": MlpPolicy}
+
+
+def test_a_policy_that_takes_the_observations_is_taken_under_any_name():
+    make("MlpPolicy", algorithm=OnePolicy)
+    make("MultiInputPolicy", policy_kwargs=dict(net_arch=[4], features_extractor_class=FlattenExtractor))
+
+
+class Extended(CGP):
+    """Has an argument more, and gives the policy itself."""
+
+    def __init__(self, env="Pendulum-v1", width=1, _init_setup_model=True, **arguments):
+        self.width = width
+        super().__init__(arguments.pop("policy", "MlpPolicy"), env, _init_setup_model=_init_setup_model, **arguments)
+
+
+def test_a_subclass_is_named_with_its_own_arguments():
+    assert Extended(width=3, **SMALL).width == 3
+    with pytest.raises(TypeError, match=r"`Extended` takes no such argument\. Did you mean `width`\?"):
+        Extended(widht=3, **SMALL)
+
+
+class OwnConstructor(TD3):
+    """Takes no policy."""
+
+    def __init__(self, env="Pendulum-v1", **arguments):
+        super().__init__("MlpPolicy", env, **arguments)
+
+
+def test_guards_leave_another_algorithms_constructor_as_it_is():
+    class Guarded(GuardedAlgorithm, OwnConstructor):
+        pass
+
+    Guarded(**SMALL)
+    assert "action_noise" in inspect.signature(GuardedTD3).parameters
 
 
 @pytest.mark.parametrize("other", [TD3, SAC])
 def test_a_model_of_another_algorithm_is_refused_with_the_remedy(other, tmp_path):
-    other("MlpPolicy", "Pendulum-v1", **SMALL).save(tmp_path / "model")
+    # SAC adds to the dictionary
+    other("MlpPolicy", "Pendulum-v1", **SMALL | dict(policy_kwargs=dict(net_arch=[4]))).save(tmp_path / "model")
     with pytest.raises(ValueError, match="another algorithm's model is loaded by that algorithm"):
         CGP.load(tmp_path / "model")

@@ -136,6 +136,15 @@ def test_a_misspelt_variable_is_refused_before_anything_is_done(goal: str, clone
     assert "There is no variable STEP, but: ALGO ENV SEED STEPS " in ended.stderr
 
 
+@pytest.mark.parametrize("given", ["CUDA_VISIBLE_DEVICES=0", "PYTEST_ADDOPTS=-x", "MAKEFLAGS=-s", "SHELL=/bin/sh"])
+def test_variables_of_other_programs_are_taken(given: str, clone: Clone) -> None:
+    assert clone.make("help", given)[1].returncode == 0
+
+
+def test_variables_of_an_outer_make_are_taken(clone: Clone) -> None:
+    assert clone.make("help", "MODE=release", MAKELEVEL="1")[1].returncode == 0
+
+
 def test_failed_training_is_not_reported(clone: Clone) -> None:
     calls, ended = clone.make("train", FAIL="rl_zoo3.train")
     assert ended.returncode != 0

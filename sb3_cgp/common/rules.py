@@ -40,6 +40,7 @@ def unknown_argument(
     choices: Iterable[str],
     remedies: Mapping[str, str] | None = None,
     usage: str | None = None,
+    cutoff: float = 0.6,
 ) -> TypeError:
     """
     Return the error for a keyword argument that does not exist.
@@ -50,10 +51,11 @@ def unknown_argument(
     :param choices: the names that are allowed
     :param remedies: sentences for names that are known to be given here by mistake
     :param usage: a sentence where no name is similar; None for one that lists the choices
+    :param cutoff: the smallest similarity of the nearest name, within [0, 1]
     :return: the error
     """
     choices = sorted(choices)
-    similar = nearest(name, choices)
+    similar = nearest(name, choices, cutoff)
     if remedies is not None and name in remedies:
         remedy = remedies[name]
     elif similar is not None:

@@ -98,8 +98,9 @@ def load_weights(folder: str | Path) -> ExportedPolicy:
         raise NotADirectoryError(
             errno.ENOTDIR, "Is a file, and no folder that `export` wrote; `load` reads a model", str(folder)
         )
-    if not Path(folder).exists() and Path(f"{folder}.zip").is_file():
-        raise FileNotFoundError(errno.ENOENT, f"There is no exported policy; `load` reads the model {folder}.zip", str(folder))
+    model = Path(f"{Path(folder)}.zip")
+    if not Path(folder).exists() and model.is_file():
+        raise FileNotFoundError(errno.ENOENT, f"There is no exported policy; `load` reads the model {model}", str(folder))
     safetensors = import_from_extra("safetensors", "export", PURPOSE)
     safetensors_torch = import_from_extra("safetensors.torch", "export", PURPOSE)
     paths = {name: Path(folder) / name for name in (DESCRIPTION_FILE, TENSORS_FILE, ONNX_FILE)}

@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_cgp.common.load_arguments import check_load_arguments, misspelt_custom_objects
 from sb3_cgp.common.rules import require
+from sb3_cgp.guards.construction import check_constructor_arguments
 
 SelfArgumentGuard = TypeVar("SelfArgumentGuard", bound="ArgumentGuard")
 
@@ -69,8 +70,10 @@ class ArgumentGuard(OffPolicyAlgorithm):
         :param kwargs: arguments to change in the model
         :return: the model
         :raises TypeError: if a model has no such argument or attribute, naming it and the nearest one that is allowed
+        :raises ValueError: if the value of an argument of SB3's is wrong, naming it
         """
         check_load_arguments(cls, path, kwargs)
+        check_constructor_arguments(kwargs | {"device": device})
         if "policy" in kwargs:
             message = (
                 f"`policy={kwargs.pop('policy')!r}` has no effect: a loaded model keeps the policy that it was saved with."

@@ -16,6 +16,8 @@ class SeedGuard(OffPolicyAlgorithm):
 
         :param seed: the seed
         """
+        # Python's random generator takes no integer of NumPy's
+        seed = None if seed is None else int(seed)
         try:
             super().set_random_seed(seed)
         except AttributeError as error:

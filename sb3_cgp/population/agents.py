@@ -63,13 +63,18 @@ def merge_arguments(agents: int | Sequence[Arguments], common: Arguments) -> lis
         check_constructor_arguments(each)
     seed = common.get("seed")
     seeds = [{} if seed is None else {"seed": seed + index} for index in range(len(agents))]
-    merged = [common | seeds[index] | own for index, own in enumerate(agents)]
+    merged = [_with_plain_seed(common | seeds[index] | own) for index, own in enumerate(agents)]
     for name in COMMON:
         for index, arguments in enumerate(merged):
             allowed = f"{merged[0].get(name)!r}, as agent 0 has it: agents that differ in `{name}` make several populations"
             require(arguments.get(name) == merged[0].get(name), f"agents[{index}]['{name}']", arguments.get(name), allowed)
     # JSON, in which SB3 saves, has no tuples
     return [_with_plain_train_freq(arguments) for arguments in merged]
+
+
+def _with_plain_seed(arguments: Arguments) -> Arguments:
+    # Gymnasium takes no integer of NumPy's
+    return arguments if arguments.get("seed") is None else arguments | {"seed": int(arguments["seed"])}
 
 
 def _with_plain_train_freq(arguments: Arguments) -> Arguments:

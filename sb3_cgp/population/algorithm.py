@@ -80,7 +80,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
         first = self.agents[0]
         super().__init__(
             policy,
-            make_vec_env(env, n_envs=len(self.agents)) if isinstance(env, str) else env,
+            make_vec_env(env, n_envs=len(self.agents)) if isinstance(env, str) else env,  # type: ignore[arg-type]
             first.get("learning_rate", 1e-3),
             policy_kwargs=first.get("policy_kwargs"),
             replay_buffer_kwargs=first.get("replay_buffer_kwargs"),

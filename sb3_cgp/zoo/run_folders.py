@@ -65,8 +65,13 @@ def how_to_continue(folder: str | Path, states: str, model: Any, n_timesteps: in
 
 def interpreter() -> str:
     """Return the command that starts this process's interpreter: "python" where the shell finds it, or else its path."""
-    executable, found = Path(sys.executable), shutil.which("python")
+    executable, found = Path(sys.executable or "python"), shutil.which("python")
     # By the folder, too, as the interpreter of a virtual environment is a link to one outside of it
-    if found is not None and Path(found).parent == executable.parent and executable.samefile(found):
+    if not executable.exists() or (
+        found is not None and Path(found).parent == executable.parent and executable.samefile(found)
+    ):
         return "python"
-    return shlex.quote(os.path.relpath(executable) if executable.is_relative_to(Path.cwd()) else str(executable))
+    relative = os.path.relpath(executable)
+    # A shell does not look for a name without a folder in the working directory
+    is_shorter = os.sep in relative and not relative.startswith(os.pardir)
+    return shlex.quote(relative if is_shorter else str(executable))
