@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from sb3_cgp.common.files import whole_file
 from sb3_cgp.common.load_arguments import check_load_arguments
 from sb3_cgp.common.rules import require
-from sb3_cgp.resumption.callback_states import initial_attributes, iter_callbacks
+from sb3_cgp.resumption.callback_states import iter_callbacks
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback, checkpoints_among
 from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.logs import continued_logger
@@ -194,8 +194,6 @@ class ResumableAlgorithm(ResumableModel):
             callback = CallbackList([callback, TrainingCheckpointCallback(**self.resumption["checkpoint"])])
             callback.init_callback(self)
         self.callback = callback
-        # A policy's offline training begins with callbacks that have counted
-        self._initial_callbacks = initial_attributes(callback) | dict(self._initial_callbacks)
         return callback
 
     def learn(self: SelfResumableAlgorithm, *args: Any, **kwargs: Any) -> SelfResumableAlgorithm:

@@ -6,7 +6,7 @@ from pathlib import Path
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cgp.common.rules import require, require_count
-from sb3_cgp.resumption.callback_states import iter_callbacks
+from sb3_cgp.resumption.callback_states import initial_attributes, iter_callbacks
 from sb3_cgp.resumption.model import ResumableModel
 from sb3_cgp.resumption.replay_buffers import check_replay_buffer
 from sb3_cgp.resumption.signals import StopSignals
@@ -55,6 +55,7 @@ class TrainingCheckpointCallback(BaseCallback):
         self._has_trained_without_rollouts = False
         # `learn` may end in the middle of a step, and a training without rollouts may follow
         self._is_within_step = False
+        self._has_noted_callbacks = False
         self.signals = StopSignals()
         # This callback and the training's others that save states, in the order in which SB3 calls them
         self._saving: list[TrainingCheckpointCallback] = []
@@ -77,6 +78,7 @@ class TrainingCheckpointCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._is_in_rollouts = self._rollout_is_over = self._has_trained_without_rollouts = False
+        self._has_noted_callbacks = False
         self._saved_at = self.num_timesteps
         if self.path is None:
             allowed = "TrainingCheckpointCallback(save_freq, path='run/state')"
@@ -99,6 +101,7 @@ class TrainingCheckpointCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         self._is_in_rollouts = True
         self._is_within_step = False
+        self._note_callbacks()
         self._restore_if_resumed()
         if self.path is None:
             return
@@ -114,6 +117,7 @@ class TrainingCheckpointCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         self._rollout_is_over = False
+        self._note_callbacks()
         if self._is_in_rollouts:
             self._is_within_step = True
         else:
@@ -149,6 +153,14 @@ class TrainingCheckpointCallback(BaseCallback):
         :param state: the counters that :meth:`get_training_state` returned
         """
         self.n_calls, self.num_timesteps = state["n_calls"], state["num_timesteps"]
+
+    def _note_callbacks(self) -> None:
+        """Note the attributes of all callbacks, once they have been told that the training starts."""
+        if self.path is not None and not self._has_noted_callbacks:
+            self._has_noted_callbacks = True
+            assert self.model.callback is not None
+            # A policy's offline training begins with callbacks that have counted
+            self.model._initial_callbacks = initial_attributes(self.model.callback) | dict(self.model._initial_callbacks)
 
     def _restore_if_resumed(self) -> None:
         if self.model.resumption is not None:
