@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import re
 import signal
 import threading
 import time
@@ -16,7 +17,10 @@ from trainings import SMALL, Do
 
 from sb3_cgp import CGP
 from sb3_cgp.resumption import TrainingCheckpointCallback
+from sb3_cgp.resumption.signals import StopSignals
 from sb3_cgp.resumption.store import StateStore
+
+SIGNALS = [(signal.SIGTERM, SystemExit, "143"), (signal.SIGINT, KeyboardInterrupt, "its state of step 40")]
 
 
 def make_model(**arguments):
@@ -30,9 +34,10 @@ def terminate():
 
 @pytest.fixture(autouse=True)
 def handler():
-    """SIGTERM's handler, which every training must leave as it was."""
+    """SIGTERM's handler, which every training must leave as it was, and no training in progress."""
     handler = signal.getsignal(signal.SIGTERM)
     yield handler
+    assert StopSignals.current() is None
     left, _ = signal.getsignal(signal.SIGTERM), signal.signal(signal.SIGTERM, handler)
     assert left is handler
 
@@ -129,10 +134,7 @@ def test_sigterm_ends_the_training_with_its_state_whenever_it_comes(at, tmp_path
 
 
 @pytest.mark.usefixtures("heeds_interruptions")
-@pytest.mark.parametrize(
-    ("number", "error", "message"),
-    [(signal.SIGTERM, SystemExit, "143"), (signal.SIGINT, KeyboardInterrupt, "its state of step 40")],
-)
+@pytest.mark.parametrize(("number", "error", "message"), SIGNALS)
 def test_a_signal_ends_the_offline_training_of_a_policy(number, error, message, tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
     stop = Do(55, lambda: os.kill(os.getpid(), number))
@@ -217,6 +219,87 @@ def test_a_second_ctrl_c_stops_at_once(tmp_path):
     with pytest.raises(KeyboardInterrupt, match=r"^$"):
         make_model().learn(50, callbacks)
     assert (seen, StateStore(tmp_path).load()[0]) == ([], 30)
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+@pytest.mark.parametrize(("number", "error", "message"), SIGNALS)
+def test_a_signal_in_the_last_step_ends_the_offline_training_that_follows(number, error, message, tmp_path):
+    press = Do(40, lambda: os.kill(os.getpid(), number))
+    steps = []
+    count = Do(41, lambda: steps.append(41))
+    with pytest.raises(error, match=message):
+        make_model(policy_training="offline").learn(40, [TrainingCheckpointCallback(10, tmp_path), press, count])
+    assert steps == []
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+@pytest.mark.parametrize(("number", "error", "message"), SIGNALS)
+@pytest.mark.parametrize("at", [0, 15], ids=["before it", "within it"])
+@pytest.mark.parametrize("saves", [True, False], ids=["states", "no states"])
+def test_a_signal_ends_a_training_within_a_callback_and_then_the_outer_one(saves, at, number, error, message, tmp_path):
+    press, inner, seen = (lambda: os.kill(os.getpid(), number)), make_model(seed=1), []
+    callbacks = [Do(at, press), *([TrainingCheckpointCallback(10, tmp_path / "inner")] if saves else [])]
+
+    def train():
+        if at == 0:
+            press()
+        inner.learn(100, callbacks)
+
+    def after():
+        seen.append("the outer training goes on")
+
+    outer = [TrainingCheckpointCallback(10, tmp_path / "outer"), Do(44, train), Do(44, after)]
+    with pytest.raises(error, match=message) as raised:
+        make_model().learn(60, outer)
+    assert (inner.num_timesteps, seen, StateStore(tmp_path / "outer").load()[0]) == (at, [], 40)
+    if saves:
+        assert StateStore(tmp_path / "inner").load()[0] == at
+    if error is KeyboardInterrupt:
+        found = f"its state of step {at} is in .*inner" if saves else "it has no state"
+        assert re.search(found, str(raised.value.__context__))
+    # Neither training is left behind
+    again = [TrainingCheckpointCallback(10, tmp_path / "again"), Do(5, press)]
+    with pytest.raises(error):
+        make_model().learn(60, again)
+    assert StateStore(tmp_path / "again").load()[0] == 5
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+@pytest.mark.parametrize(("number", "error", "message"), SIGNALS)
+def test_an_outer_training_whose_callback_takes_the_inner_ones_interrupt_saves_and_ends(number, error, message, tmp_path):
+    def train():
+        inner = [TrainingCheckpointCallback(10, tmp_path / "inner"), Do(15, lambda: os.kill(os.getpid(), number))]
+        with pytest.raises(error):
+            make_model(seed=1).learn(60, inner)
+
+    with pytest.raises(error, match=message.replace("40", "44")):
+        make_model().learn(60, [TrainingCheckpointCallback(10, tmp_path), Do(44, train)])
+    assert StateStore(tmp_path).load()[0] == 44
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+def test_a_second_ctrl_c_stops_an_inner_training_at_once(tmp_path):
+    press, seen = (lambda: signal.raise_signal(signal.SIGINT)), []
+    inner = [TrainingCheckpointCallback(10, tmp_path / "inner"), Do(15, press), Do(15, press), Do(15, lambda: seen.append(15))]
+    train = Do(44, lambda: make_model(seed=1).learn(60, inner))
+    with pytest.raises(KeyboardInterrupt, match=r"^$"):
+        make_model().learn(60, [TrainingCheckpointCallback(10, tmp_path / "outer"), train])
+    assert (seen, StateStore(tmp_path / "inner").load()[0], StateStore(tmp_path / "outer").load()[0]) == ([], 10, 40)
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+def test_a_training_in_another_thread_does_not_end_by_the_signal_of_the_main_ones(tmp_path):
+    steps = []
+
+    def train():
+        thread = threading.Thread(target=lambda: steps.append(make_model(seed=1).learn(30).num_timesteps))
+        signal.raise_signal(signal.SIGINT)
+        thread.start()
+        thread.join()
+
+    with pytest.raises(KeyboardInterrupt):
+        make_model().learn(60, [TrainingCheckpointCallback(10, tmp_path), Do(44, train)])
+    assert (steps, StateStore(tmp_path).load()[0]) == ([30], 44)
 
 
 @pytest.mark.usefixtures("heeds_interruptions")

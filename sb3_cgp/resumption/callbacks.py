@@ -9,9 +9,11 @@ from sb3_cgp.common.rules import require, require_count
 from sb3_cgp.resumption.callback_states import initial_attributes, iter_callbacks
 from sb3_cgp.resumption.model import ResumableModel
 from sb3_cgp.resumption.replay_buffers import check_replay_buffer
-from sb3_cgp.resumption.signals import StopSignals
+from sb3_cgp.resumption.signals import StopSignals, end_training
 from sb3_cgp.resumption.state import gather, restore, warn_of_unsaved
 from sb3_cgp.resumption.store import StateStore
+
+NO_STATE = "it has no state"
 
 
 class TrainingCheckpointCallback(BaseCallback):
@@ -25,7 +27,8 @@ class TrainingCheckpointCallback(BaseCallback):
     On SIGTERM, which a cluster's scheduler sends, and on Ctrl-C, the state is saved when the next rollout would start. Then
     the process exits with status 143, or ``learn`` raises ``KeyboardInterrupt``. A training without rollouts ends at its next
     step without saving, as the state at its start was saved. A second signal has the effect that it has without this callback.
-    Of several such callbacks, the first one handles the signals.
+    Of several such callbacks, the first one handles the signals. A training within a callback of another training ends
+    first, and saves its state; the exception then ends the other one within its step, whose last state remains.
 
     One training at a time can use the folder. It is locked from ``resume``, or the start of ``learn``, until ``learn`` ends.
 
@@ -105,7 +108,7 @@ class TrainingCheckpointCallback(BaseCallback):
         self._restore_if_resumed()
         if self.path is None:
             return
-        asked = next((each for each in self._saving if each.signals.noted is not None), None)
+        asked = next((each for each in self._saving if each.noted_signal is not None), None)
         if asked is not None:
             if self.num_timesteps > self._saved_at or not self.has_state:
                 self._save()
@@ -180,6 +183,12 @@ class TrainingCheckpointCallback(BaseCallback):
         if self.verbose >= 2:
             print(f"Saving the training state of step {self.num_timesteps} to {self.path}")
 
+    @property
+    def noted_signal(self) -> int | None:
+        """The signal that asks this training to end, or the one in one of whose callbacks it runs; None without one."""
+        outer = self.model._outer_signals
+        return outer.noted if self.signals.noted is None and outer is not None else self.signals.noted
+
     def stop_if_asked(self) -> None:
         """
         End the training if a signal has asked for it.
@@ -187,15 +196,18 @@ class TrainingCheckpointCallback(BaseCallback):
         :raises KeyboardInterrupt: after Ctrl-C
         :raises SystemExit: after SIGTERM
         """
-        if self.signals.noted is not None:
+        number = self.noted_signal
+        if number is not None:
+            # An outer training's signal stays noted, for the outer one to end as well
+            self.signals.noted = None
             kept = f"its state of step {self._saved_at} is in {self.path}; `resume` continues it"
-            self.signals.end(f"The training was interrupted: {kept if self.has_state else 'it has no state'}")
+            end_training(number, f"The training was interrupted: {kept if self.has_state else NO_STATE}")
 
     def release(self) -> None:
         """Restore the signals' handlers. Save no state until the next training starts, as this one may have failed."""
         self._rollout_is_over = self._has_trained_without_rollouts = False
         self._saving = []
-        self.signals.restore()
+        self.signals.release()
 
 
 def checkpoints_among(callback: BaseCallback) -> list[TrainingCheckpointCallback]:

@@ -11,10 +11,16 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cgp.resumption.callback_states import Fingerprints
 from sb3_cgp.resumption.locks import FolderLock
+from sb3_cgp.resumption.signals import StopSignals
 
 State = dict[str, Any]
 # The attributes below, which describe a running training and are not part of SB3's zip
-UNSAVED = ("callback", "resumption", "saved_to", "_folder_locks", "_n_nested_trainings", "_warned_of", "_initial_callbacks")
+UNSAVED = (
+    *("callback", "resumption", "saved_to", "_folder_locks", "_n_nested_trainings", "_warned_of", "_initial_callbacks"),
+    "_outer_signals",
+)
+# Those that a copy does not have, as it does not take part in the running training
+UNCOPIED = ("callback", "_folder_locks", "_initial_callbacks", "_outer_signals")
 
 
 class ResumableModel(OffPolicyAlgorithm):
@@ -34,6 +40,8 @@ class ResumableModel(OffPolicyAlgorithm):
     _folder_locks: Mapping[Path, FolderLock] = MappingProxyType({})
     # A policy's offline training may run within `learn`
     _n_nested_trainings: int = 0
+    # The signals of the training in one of whose callbacks this one runs
+    _outer_signals: StopSignals | None = None
     # The warnings about the training state that were given in this training
     _warned_of: frozenset[str] = frozenset()
 
@@ -89,10 +97,7 @@ class ResumableModel(OffPolicyAlgorithm):
         # Python has a method of this name since 3.11
         inherited = getattr(super(), "__getstate__", None)
         state = vars(self) if inherited is None else inherited()
-        # A copy does not take part in the running training, and has neither its callbacks nor its locks
-        kept = {
-            name: value for name, value in state.items() if name not in ("callback", "_folder_locks", "_initial_callbacks")
-        }
+        kept = {name: value for name, value in state.items() if name not in UNCOPIED}
         return kept | {"_n_nested_trainings": 0}
 
     def _excluded_save_params(self) -> list[str]:
