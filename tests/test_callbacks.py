@@ -1,5 +1,6 @@
 """The callback that saves states: its folder, its signal, and what it refuses before a training begins."""
 
+import copy
 import multiprocessing
 import os
 import re
@@ -230,6 +231,29 @@ def test_a_signal_in_the_last_step_ends_the_offline_training_that_follows(number
     with pytest.raises(error, match=message):
         make_model(policy_training="offline").learn(40, [TrainingCheckpointCallback(10, tmp_path), press, count])
     assert steps == []
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+@pytest.mark.parametrize("has_learnt_in_it", [True, False])
+def test_an_interrupted_train_policy_says_that_it_is_to_be_called_again(has_learnt_in_it, tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
+    checkpoint = TrainingCheckpointCallback(10, tmp_path)
+    model = make_model().learn(30, checkpoint if has_learnt_in_it else None)
+    press = Do(5, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt, match="`train_policy` saves no state before its end; call it again"):
+        model.train_policy(60, callback=[checkpoint, press])
+    assert StateStore(tmp_path).steps() == ([20, 30] if has_learnt_in_it else [])
+    assert model.train_policy(20, callback=checkpoint)._policy_is_trained
+    assert StateStore(tmp_path).load()[0] == 30
+
+
+def test_a_model_without_an_environment_is_refused_before_it_trains_its_policy(tmp_path):
+    model = make_model().learn(30)
+    model.env = None
+    before = copy.deepcopy(model.policy.state_dict())
+    with pytest.raises(ValueError, match="The value of `env` is None, but must be set, by `set_env`"):
+        model.train_policy(5, callback=TrainingCheckpointCallback(10, tmp_path))
+    assert all(before[name].equal(value) for name, value in model.policy.state_dict().items())
 
 
 @pytest.mark.usefixtures("heeds_interruptions")

@@ -80,7 +80,8 @@ class ResumableAlgorithm(ResumableModel):
         :param env: the environment, made as for the first call (if registered in Gym, can be str); its state is restored when
             ``learn`` starts
         :param device: Device on which the code should run.
-        :param kwargs: arguments to change in the model, see :meth:`load`
+        :param kwargs: arguments to change in the model, and those of :meth:`load` but for ``force_reset``, as the state of the
+            environment is restored
         :return: the model
         :raises FileNotFoundError: if the folder holds no state
         :raises ValueError: if all states are damaged, naming the files, or if the environment or an argument does not fit
@@ -113,6 +114,11 @@ class ResumableAlgorithm(ResumableModel):
         require(state["algorithm"] == cls.__name__, "path", str(store.folder), f"of {cls.__name__}, not {state['algorithm']}")
         saved = io.BytesIO(state.pop("model"))
         check_load_arguments(cls, saved, kwargs, "resume")
+        if "force_reset" in kwargs:
+            raise TypeError(
+                f"The value of `force_reset` is {kwargs['force_reset']!r}, but `{cls.__name__}.resume` takes no such argument."
+                " Leave it out: a resumed training restores the environment's state. `load` takes it, for a new episode."
+            )
         model = cls.load(saved, env, device, force_reset=False, **kwargs)
         assert model.env is not None
         check_fits(model, state)

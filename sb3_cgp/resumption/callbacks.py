@@ -26,9 +26,10 @@ class TrainingCheckpointCallback(BaseCallback):
 
     On SIGTERM, which a cluster's scheduler sends, and on Ctrl-C, the state is saved when the next rollout would start. Then
     the process exits with status 143, or ``learn`` raises ``KeyboardInterrupt``. A training without rollouts ends at its next
-    step without saving, as the state at its start was saved. A second signal has the effect that it has without this callback.
-    Of several such callbacks, the first one handles the signals. A training within a callback of another training ends
-    first, and saves its state; the exception then ends the other one within its step, whose last state remains.
+    step without saving: ``learn`` has saved the state at its start, and a user's call of ``train_policy`` is to be repeated. A
+    second signal has the effect that it has without this callback. Of several such callbacks, the first one handles the
+    signals. A training within a callback of another training ends first, and saves its state; the exception then ends the
+    other one within its step, whose last state remains.
 
     One training at a time can use the folder. It is locked from ``resume``, or the start of ``learn``, until ``learn`` ends.
 
@@ -38,7 +39,7 @@ class TrainingCheckpointCallback(BaseCallback):
     :param keep: how many states to keep, the newest ones
     :param verbose: Verbosity level: 0 for no output, 2 for indicating when a state is saved
     :raises ValueError: if an argument is out of its range, or, when the training starts, if the folder holds the states of
-        another training, or the replay buffer cannot be saved
+        another training, the model has no environment, or the replay buffer cannot be saved
     :raises FolderInUseError: when the training starts, if another training uses the folder
     :raises OSError: when the training starts or a state is due, if the folder cannot be written to
     """
@@ -89,6 +90,8 @@ class TrainingCheckpointCallback(BaseCallback):
                 f"No state of the training will be saved, as `path` is None; give a folder, as in {allowed}.", stacklevel=2
             )
             return
+        allowed = "set, by `set_env` or the argument `env` of `load`, where the training is saved"
+        require(self.model.env is not None, "env", None, allowed)
         check_replay_buffer(self.model._ensure_replay_buffer())
         self._store = StateStore(self._folder, self.keep)
         self._store.prepare()
@@ -200,8 +203,15 @@ class TrainingCheckpointCallback(BaseCallback):
         if number is not None:
             # An outer training's signal stays noted, for the outer one to end as well
             self.signals.noted = None
-            kept = f"its state of step {self._saved_at} is in {self.path}; `resume` continues it"
-            end_training(number, f"The training was interrupted: {kept if self.has_state else NO_STATE}")
+            end_training(number, f"The training was interrupted: {self._kept_state}")
+
+    @property
+    def _kept_state(self) -> str:
+        """The state that an interrupted training has, or the remedy."""
+        if self._has_trained_without_rollouts and self.model._n_nested_trainings == 1:
+            # Not by `learn`, which saves the state at the start, and repeats this training
+            return "`train_policy` saves no state before its end; call it again to go on from the actor as it is"
+        return f"its state of step {self._saved_at} is in {self.path}; `resume` continues it" if self.has_state else NO_STATE
 
     def release(self) -> None:
         """Restore the signals' handlers. Save no state until the next training starts, as this one may have failed."""
