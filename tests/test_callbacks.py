@@ -147,6 +147,16 @@ def test_a_signal_ends_the_offline_training_of_a_policy(number, error, message, 
     assert parameters_equal(resumed.learn(40), make_model(policy_training="offline").learn(40))
 
 
+def test_a_resumed_offline_training_without_callbacks_is_saved_at_its_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
+    with pytest.raises(SystemExit):
+        make_model(policy_training="offline").learn(40, [TrainingCheckpointCallback(10, tmp_path), Do(45, terminate)])
+    resumed = CGP.resume(tmp_path, make_vec_env("Pendulum-v1")).learn(40)
+    finished = CGP.resume(tmp_path, make_vec_env("Pendulum-v1"))
+    assert finished._policy_is_trained
+    assert parameters_equal(finished, resumed)
+
+
 @pytest.mark.parametrize("at", [20, 55], ids=["critics", "policy"])
 def test_sigterm_during_an_evaluation(at, tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)

@@ -198,7 +198,10 @@ class ResumableAlgorithm(ResumableModel):
         for bar in bars if self.resumption is not None else ():
             show_whole_training(bar, self)
         if self.resumption is not None and not checkpoints:
-            callback = CallbackList([callback, TrainingCheckpointCallback(**self.resumption["checkpoint"])])
+            self._added_checkpoint = TrainingCheckpointCallback(**self.resumption["checkpoint"])
+        if self._added_checkpoint is not None and not checkpoints:
+            # Also in the offline training of a policy that follows, which saves a state at its end
+            callback = CallbackList([callback, self._added_checkpoint])
             callback.init_callback(self)
         self.callback = callback
         return callback
@@ -267,7 +270,7 @@ class ResumableAlgorithm(ResumableModel):
             if self._n_nested_trainings == 0:
                 self._warned_of = frozenset()
                 self._initial_callbacks = {}
-                self._outer_signals = None
+                self._outer_signals = self._added_checkpoint = None
                 self.release_folders()
 
     def _checkpoints(self) -> list[TrainingCheckpointCallback]:

@@ -17,10 +17,10 @@ State = dict[str, Any]
 # The attributes below, which describe a running training and are not part of SB3's zip
 UNSAVED = (
     *("callback", "resumption", "saved_to", "_folder_locks", "_n_nested_trainings", "_warned_of", "_initial_callbacks"),
-    "_outer_signals",
+    *("_outer_signals", "_added_checkpoint"),
 )
 # Those that a copy does not have, as it does not take part in the running training
-UNCOPIED = ("callback", "_folder_locks", "_initial_callbacks", "_outer_signals")
+UNCOPIED = ("callback", "_folder_locks", "_initial_callbacks", "_outer_signals", "_added_checkpoint")
 
 
 class ResumableModel(OffPolicyAlgorithm):
@@ -40,6 +40,8 @@ class ResumableModel(OffPolicyAlgorithm):
     _folder_locks: Mapping[Path, FolderLock] = MappingProxyType({})
     # A policy's offline training may run within `learn`
     _n_nested_trainings: int = 0
+    # The callback that saves states in a resumed training without one among its callbacks
+    _added_checkpoint: BaseCallback | None = None
     # The signals of the training in one of whose callbacks this one runs
     _outer_signals: StopSignals | None = None
     # The warnings about the training state that were given in this training
