@@ -1,9 +1,15 @@
 """A callback that is missing from a resumed training is named if it had counted something, and not otherwise."""
 
+import copy
+import sys
+import threading
 import warnings
+from collections import Counter, defaultdict, deque
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -11,12 +17,13 @@ from stable_baselines3.common.callbacks import (
     ConvertCallback,
     EvalCallback,
     EveryNTimesteps,
+    ProgressBarCallback,
     StopTrainingOnMaxEpisodes,
 )
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cgp import CGP, HParamsCallback, TrainingCheckpointCallback
-from sb3_cgp.resumption.plain_data import equal_plain, to_plain
+from sb3_cgp.resumption.fingerprints import fingerprint
 
 TINY = dict(learning_starts=5, batch_size=4, buffer_size=300, policy_kwargs=dict(net_arch=[4]), device="cpu", seed=0)
 
@@ -58,14 +65,41 @@ class Declaring(BaseCallback):
         return True
 
 
-def missing(callback, folder, **arguments):
+@dataclass
+class Statistics:
+    """An object of a class of the user's own, within which something is counted."""
+
+    lengths: list = field(default_factory=list)
+    model: object = None
+
+
+class Keeping(BaseCallback):
+    """Keeps an object, which it changes at each step, or else notes when the training starts."""
+
+    def __init__(self, kept, count=None):
+        super().__init__()
+        self.kept, self.count = kept, count
+
+    def _on_training_start(self):
+        if self.count is None:
+            self.start, self.scratch = threading.get_ident(), {"at": self.num_timesteps}
+        if isinstance(self.kept, Statistics):
+            self.kept.model = self.model
+
+    def _on_step(self):
+        if self.count is not None:
+            self.count(self.kept)
+        return True
+
+
+def missing(callback, folder, steps=220, **arguments):
     """Resume a training without a callback that the first part had; return the warnings about it."""
     model = CGP("MlpPolicy", "Pendulum-v1", **TINY, **arguments)
-    model.learn(220, callback=[TrainingCheckpointCallback(20, folder), callback])
+    model.learn(steps, callback=[TrainingCheckpointCallback(min(steps, 20), folder), callback])
     del model
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        CGP.resume(folder, "Pendulum-v1").learn(240)
+        CGP.resume(folder, "Pendulum-v1").learn(steps + 20)
     return [str(each.message) for each in warned if "was among the callbacks, and is not now" in str(each.message)]
 
 
@@ -115,6 +149,35 @@ def test_a_callback_that_has_counted_is_missed_by_name(callback, tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    "callback",
+    [*map(Keeping, (None, Counter(a=1), th.ones(2), Statistics(), sys.stderr, threading.Lock())), ProgressBarCallback()],
+    ids=lambda each: type(getattr(each, "kept", each)).__name__,
+)
+@pytest.mark.filterwarnings("ignore:rich is experimental")
+def test_a_callback_that_keeps_an_object_and_does_not_change_it_is_not_missed(callback, tmp_path):
+    assert missing(callback, tmp_path, steps=8) == []
+
+
+@pytest.mark.parametrize(
+    ("kept", "count"),
+    [
+        (Counter(), lambda kept: kept.update("a")),
+        (defaultdict(lambda: 0), lambda kept: kept.update(a=kept["a"] + 1)),
+        (deque(maxlen=3), lambda kept: kept.append(len(kept))),
+        (type("Own", (list,), {})(), lambda kept: kept.append(None)),
+        (th.zeros(2), lambda kept: kept.add_(1)),
+        (th.nn.Linear(1, 1), lambda kept: th.nn.init.zeros_(kept.weight)),
+        (Statistics(), lambda kept: kept.lengths.append(1)),
+        ({"within": [Statistics()]}, lambda kept: kept["within"][0].lengths.append(1)),
+        ([], lambda kept: kept.append(1)),
+    ],
+    ids=lambda each: type(each).__name__,
+)
+def test_what_a_callback_counts_in_any_object_is_missed(kept, count, tmp_path):
+    assert len(missing(Keeping(kept, count), tmp_path, steps=8)) == 1
+
+
 def test_what_was_counted_before_the_offline_training_of_a_policy_counts(tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
     # Its value does not change in the training of the policy, which begins the callbacks anew
@@ -139,7 +202,7 @@ def test_what_was_counted_before_a_resumption_counts(tmp_path):
 @pytest.mark.parametrize(
     "value", [None, 3, 0.5, float("nan"), "a", b"a", np.float32(1), np.array([1.0, np.nan]), [1, (2, {})]]
 )
-def test_plain_data_is_equal_to_itself_and_to_nothing_else(value):
+def test_the_fingerprint_of_a_value_is_that_of_a_copy_and_of_nothing_else(value):
     others = [
         1,
         1.0,
@@ -153,5 +216,5 @@ def test_plain_data_is_equal_to_itself_and_to_nothing_else(value):
         np.array([1, 2]),
         np.float64(1),
     ]
-    assert equal_plain(to_plain(value), to_plain(value))
-    assert not any(equal_plain(to_plain(value), to_plain(other)) for other in others)
+    assert fingerprint(value) == fingerprint(copy.deepcopy(value)) is not None
+    assert fingerprint(value) not in map(fingerprint, others)

@@ -1,7 +1,9 @@
 """The callback that saves states: its folder, its signal, and what it refuses before a training begins."""
 
+import copy
 import multiprocessing
 import os
+import re
 import signal
 import threading
 import time
@@ -16,7 +18,10 @@ from trainings import SMALL, Do
 
 from sb3_cgp import CGP
 from sb3_cgp.resumption import TrainingCheckpointCallback
+from sb3_cgp.resumption.signals import StopSignals
 from sb3_cgp.resumption.store import StateStore
+
+SIGNALS = [(signal.SIGTERM, SystemExit, "143"), (signal.SIGINT, KeyboardInterrupt, "its state of step 40")]
 
 
 def make_model(**arguments):
@@ -30,9 +35,10 @@ def terminate():
 
 @pytest.fixture(autouse=True)
 def handler():
-    """SIGTERM's handler, which every training must leave as it was."""
+    """SIGTERM's handler, which every training must leave as it was, and no training in progress."""
     handler = signal.getsignal(signal.SIGTERM)
     yield handler
+    assert StopSignals.current() is None
     left, _ = signal.getsignal(signal.SIGTERM), signal.signal(signal.SIGTERM, handler)
     assert left is handler
 
@@ -129,10 +135,7 @@ def test_sigterm_ends_the_training_with_its_state_whenever_it_comes(at, tmp_path
 
 
 @pytest.mark.usefixtures("heeds_interruptions")
-@pytest.mark.parametrize(
-    ("number", "error", "message"),
-    [(signal.SIGTERM, SystemExit, "143"), (signal.SIGINT, KeyboardInterrupt, "its state of step 40")],
-)
+@pytest.mark.parametrize(("number", "error", "message"), SIGNALS)
 def test_a_signal_ends_the_offline_training_of_a_policy(number, error, message, tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
     stop = Do(55, lambda: os.kill(os.getpid(), number))
@@ -142,6 +145,16 @@ def test_a_signal_ends_the_offline_training_of_a_policy(number, error, message, 
     assert not resumed._policy_is_trained
     assert resumed.num_timesteps == 40
     assert parameters_equal(resumed.learn(40), make_model(policy_training="offline").learn(40))
+
+
+def test_a_resumed_offline_training_without_callbacks_is_saved_at_its_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
+    with pytest.raises(SystemExit):
+        make_model(policy_training="offline").learn(40, [TrainingCheckpointCallback(10, tmp_path), Do(45, terminate)])
+    resumed = CGP.resume(tmp_path, make_vec_env("Pendulum-v1")).learn(40)
+    finished = CGP.resume(tmp_path, make_vec_env("Pendulum-v1"))
+    assert finished._policy_is_trained
+    assert parameters_equal(finished, resumed)
 
 
 @pytest.mark.parametrize("at", [20, 55], ids=["critics", "policy"])
@@ -217,6 +230,110 @@ def test_a_second_ctrl_c_stops_at_once(tmp_path):
     with pytest.raises(KeyboardInterrupt, match=r"^$"):
         make_model().learn(50, callbacks)
     assert (seen, StateStore(tmp_path).load()[0]) == ([], 30)
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+@pytest.mark.parametrize(("number", "error", "message"), SIGNALS)
+def test_a_signal_in_the_last_step_ends_the_offline_training_that_follows(number, error, message, tmp_path):
+    press = Do(40, lambda: os.kill(os.getpid(), number))
+    steps = []
+    count = Do(41, lambda: steps.append(41))
+    with pytest.raises(error, match=message):
+        make_model(policy_training="offline").learn(40, [TrainingCheckpointCallback(10, tmp_path), press, count])
+    assert steps == []
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+@pytest.mark.parametrize("has_learnt_in_it", [True, False])
+def test_an_interrupted_train_policy_says_that_it_is_to_be_called_again(has_learnt_in_it, tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
+    checkpoint = TrainingCheckpointCallback(10, tmp_path)
+    model = make_model().learn(30, checkpoint if has_learnt_in_it else None)
+    press = Do(5, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt, match="`train_policy` saves no state before its end; call it again"):
+        model.train_policy(60, callback=[checkpoint, press])
+    assert StateStore(tmp_path).steps() == ([20, 30] if has_learnt_in_it else [])
+    assert model.train_policy(20, callback=checkpoint)._policy_is_trained
+    assert StateStore(tmp_path).load()[0] == 30
+
+
+def test_a_model_without_an_environment_is_refused_before_it_trains_its_policy(tmp_path):
+    model = make_model().learn(30)
+    model.env = None
+    before = copy.deepcopy(model.policy.state_dict())
+    with pytest.raises(ValueError, match="The value of `env` is None, but must be set, by `set_env`"):
+        model.train_policy(5, callback=TrainingCheckpointCallback(10, tmp_path))
+    assert all(before[name].equal(value) for name, value in model.policy.state_dict().items())
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+@pytest.mark.parametrize(("number", "error", "message"), SIGNALS)
+@pytest.mark.parametrize("at", [0, 15], ids=["before it", "within it"])
+@pytest.mark.parametrize("saves", [True, False], ids=["states", "no states"])
+def test_a_signal_ends_a_training_within_a_callback_and_then_the_outer_one(saves, at, number, error, message, tmp_path):
+    press, inner, seen = (lambda: os.kill(os.getpid(), number)), make_model(seed=1), []
+    callbacks = [Do(at, press), *([TrainingCheckpointCallback(10, tmp_path / "inner")] if saves else [])]
+
+    def train():
+        if at == 0:
+            press()
+        inner.learn(100, callbacks)
+
+    def after():
+        seen.append("the outer training goes on")
+
+    outer = [TrainingCheckpointCallback(10, tmp_path / "outer"), Do(44, train), Do(44, after)]
+    with pytest.raises(error, match=message) as raised:
+        make_model().learn(60, outer)
+    assert (inner.num_timesteps, seen, StateStore(tmp_path / "outer").load()[0]) == (at, [], 40)
+    if saves:
+        assert StateStore(tmp_path / "inner").load()[0] == at
+    if error is KeyboardInterrupt:
+        found = f"its state of step {at} is in .*inner" if saves else "it has no state"
+        assert re.search(found, str(raised.value.__context__))
+    # Neither training is left behind
+    again = [TrainingCheckpointCallback(10, tmp_path / "again"), Do(5, press)]
+    with pytest.raises(error):
+        make_model().learn(60, again)
+    assert StateStore(tmp_path / "again").load()[0] == 5
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+@pytest.mark.parametrize(("number", "error", "message"), SIGNALS)
+def test_an_outer_training_whose_callback_takes_the_inner_ones_interrupt_saves_and_ends(number, error, message, tmp_path):
+    def train():
+        inner = [TrainingCheckpointCallback(10, tmp_path / "inner"), Do(15, lambda: os.kill(os.getpid(), number))]
+        with pytest.raises(error):
+            make_model(seed=1).learn(60, inner)
+
+    with pytest.raises(error, match=message.replace("40", "44")):
+        make_model().learn(60, [TrainingCheckpointCallback(10, tmp_path), Do(44, train)])
+    assert StateStore(tmp_path).load()[0] == 44
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+def test_a_second_ctrl_c_stops_an_inner_training_at_once(tmp_path):
+    press, seen = (lambda: signal.raise_signal(signal.SIGINT)), []
+    inner = [TrainingCheckpointCallback(10, tmp_path / "inner"), Do(15, press), Do(15, press), Do(15, lambda: seen.append(15))]
+    train = Do(44, lambda: make_model(seed=1).learn(60, inner))
+    with pytest.raises(KeyboardInterrupt, match=r"^$"):
+        make_model().learn(60, [TrainingCheckpointCallback(10, tmp_path / "outer"), train])
+    assert (seen, StateStore(tmp_path / "inner").load()[0], StateStore(tmp_path / "outer").load()[0]) == ([], 10, 40)
+
+
+@pytest.mark.usefixtures("heeds_interruptions")
+def test_a_training_in_another_thread_does_not_end_by_the_signal_of_the_main_ones(tmp_path):
+    steps = []
+
+    def train():
+        thread = threading.Thread(target=lambda: steps.append(make_model(seed=1).learn(30).num_timesteps))
+        signal.raise_signal(signal.SIGINT)
+        thread.start()
+        thread.join()
+
+    with pytest.raises(KeyboardInterrupt):
+        make_model().learn(60, [TrainingCheckpointCallback(10, tmp_path), Do(44, train)])
+    assert (steps, StateStore(tmp_path).load()[0]) == ([30], 44)
 
 
 @pytest.mark.usefixtures("heeds_interruptions")

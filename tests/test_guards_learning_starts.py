@@ -140,6 +140,31 @@ def test_a_population_that_learns_nothing_is_warned_of_by_the_steps_of_an_agent(
         population.learn(80)
 
 
+@pytest.mark.parametrize("overlap", [False, True])
+@pytest.mark.parametrize(
+    ("starts", "message"),
+    [
+        ((0, 20, 3), "Agent 1 learns nothing: .* and their gradient steps begin after step learning_starts=20"),
+        ((50, 5, 20), "Agents 0 and 2 learn nothing: the training ends at environment step 20 of each agent, .*=20 to 50"),
+        ((30, 20, 19, 20), "Agents 0, 1 and 3 learn nothing: .* smaller `learning_starts`, such as 2[.]"),
+        ((19, 19), None),
+    ],
+)
+def test_agents_of_a_population_that_learn_nothing_are_named(starts, message, overlap):
+    population = Population(
+        "MlpPolicy", "Pendulum-v1", [dict(learning_starts=each) for each in starts], overlap=overlap, **POPULATION
+    )
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        started = Started(warned)
+        population.learn(20 * len(starts), started)
+    assert [agent for agent, n in enumerate(population._agent_updates) if n == 0] == [
+        agent for agent, start in enumerate(starts) if start >= 20
+    ]
+    assert len(warned) == started.before == (message is not None)
+    assert message is None or re.search(message, str(warned[0].message))
+
+
 @pytest.mark.filterwarnings("error")
 def test_a_training_that_is_not_to_learn_or_to_step_is_not_warned_of():
     GuardedTD3("MlpPolicy", located(), **(SMALL | dict(gradient_steps=0))).learn(5)

@@ -15,7 +15,7 @@ from environments import Doubles, Reach
 from gymnasium import spaces
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from stable_baselines3 import HerReplayBuffer
+from stable_baselines3 import TD3, HerReplayBuffer
 from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
@@ -24,6 +24,7 @@ from trainings import SMALL, Interruption, Stop, Training, assert_same, fingerpr
 
 from sb3_cgp import CGP
 from sb3_cgp.resumption import TrainingCheckpointCallback
+from sb3_cgp.resumption.algorithm import resumable
 
 
 class Images(Doubles):
@@ -301,6 +302,21 @@ def test_what_does_not_fit_is_refused(tmp_path):
         CGP.resume(tmp_path / "state", training.make_env(1), buffer_size=20)
     with pytest.raises(FileNotFoundError, match="nowhere"):
         CGP.resume(tmp_path / "nowhere", training.make_env(1))
+
+
+@pytest.mark.parametrize("value", [True, False])
+@pytest.mark.parametrize("algorithm", [CGP, resumable(TD3)], ids=["CGP", "TD3"])
+def test_a_reset_of_the_environment_is_no_argument_of_resume(algorithm, value, tmp_path):
+    arguments = dict(policy_kwargs=dict(net_arch=[8]), learning_starts=5, buffer_size=20, batch_size=4, device="cpu")
+    algorithm("MlpPolicy", "Pendulum-v1", **arguments).learn(8, callback=TrainingCheckpointCallback(8, tmp_path))
+    message = (
+        rf"`force_reset` is {value}, but `{algorithm.__name__}.resume` takes no such argument\. Leave it out: .* restores"
+    )
+    with pytest.raises(TypeError, match=message):
+        algorithm.resume(tmp_path, "Pendulum-v1", force_reset=value)
+    # The other arguments of `load`; the folder is not locked
+    model = algorithm.resume(tmp_path, "Pendulum-v1", custom_objects={}, print_system_info=False, batch_size=3)
+    assert model.batch_size == 3
 
 
 def test_hindsight_with_the_environments_information_is_refused_before_it_trains(tmp_path):

@@ -5,12 +5,18 @@ import signal
 import socket
 import subprocess
 import sys
+import time
+from multiprocessing import get_context
 
 import pytest
+from filelock import FileLock
 from ledgers import forked
 from optuna.exceptions import StorageInternalError
+from optuna.storages._rdb.models import BaseModel
+from sqlalchemy import event
 from studies import GRACE, assert_each_run_once, make_sweep, pretend_to_train
 
+from benchmark.sweeps import storages
 from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.heartbeats import PROGRESS
 from benchmark.sweeps.storages import open_storage, patiently
@@ -75,6 +81,39 @@ def test_processes_that_make_a_database_at_once(tmp_path):
         url = f"sqlite:///{tmp_path}/{attempt}/studies.db"
         children = [forked(lambda url=url: open_storage(url).get_all_studies()) for _ in range(4)]
         assert [os.waitpid(child, 0)[1] for child in children] == [0] * 4
+
+
+@pytest.mark.parametrize("is_empty_file", [False, True])
+def test_processes_create_the_tables_one_after_another(is_empty_file, tmp_path, monkeypatch):
+    """Without patience, as on a machine that is too busy: each would find no tables while the others create them."""
+    monkeypatch.setattr(storages, "TABLES_TIMEOUT", 0.0)
+    started = get_context("fork").Barrier(3)
+    if is_empty_file:
+        (tmp_path / "studies.db").touch()
+
+    def create():
+        event.listen(BaseModel.metadata, "before_create", lambda *args, **kwargs: time.sleep(0.3))
+        started.wait(60)
+        open_storage(f"sqlite:///{tmp_path}/studies.db").get_all_studies()
+
+    assert [os.waitpid(child, 0)[1] for child in [forked(create) for _ in range(3)]] == [0] * 3
+
+
+def test_a_file_with_all_tables_is_opened_without_the_lock(tmp_path, monkeypatch):
+    url = f"sqlite:///{tmp_path}/studies.db"
+    open_storage(url)
+    monkeypatch.setattr(storages, "FileLock", lambda *args, **kwargs: pytest.fail("waits for the lock"))
+    assert open_storage(url).get_all_studies() == []
+
+
+@pytest.mark.parametrize("error", [OSError, NotImplementedError])
+def test_a_file_on_a_file_system_without_locks_is_opened(error, tmp_path, monkeypatch):
+    class Lock(FileLock):
+        def acquire(self, *args, **kwargs):
+            raise error
+
+    monkeypatch.setattr(storages, "FileLock", Lock)
+    assert open_storage(f"sqlite:///{tmp_path}/studies.db").get_all_studies() == []
 
 
 PROXY = """

@@ -2,12 +2,15 @@
 
 import time
 from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 import grpc
 import optuna
+from alembic.migration import MigrationContext
+from filelock import FileLock
 from optuna.storages import BaseStorage, GrpcStorageProxy, RDBStorage, get_storage
 from sqlalchemy import create_engine, event
 from sqlalchemy.engine import URL, make_url
@@ -44,11 +47,7 @@ def open_storage(url: str) -> BaseStorage:
     database = _read_url(url)
     if database.get_backend_name() != "sqlite":
         return get_storage(_open_database(database, {"pool_pre_ping": True}))
-    assert database.database is not None
-    Path(database.database).parent.mkdir(parents=True, exist_ok=True)
-    storage = _open_database(database, {"connect_args": {"timeout": SQLITE_TIMEOUT}})
-    _make_transactions_exclusive(storage)
-    return get_storage(storage)
+    return get_storage(_open_sqlite(database))
 
 
 def _read_url(url: str) -> URL:
@@ -78,6 +77,35 @@ def _is_in_memory(database: URL) -> bool:
     """Return whether a database of SQLite is in memory, as its URL says it in one of several ways."""
     name = database.database or ""
     return name in ("", "file:") or ":memory:" in name or database.query.get("mode") == "memory"
+
+
+def _open_sqlite(database: URL) -> RDBStorage:
+    """
+    Open a file of SQLite. Processes that find it without Optuna's tables create them one after another.
+
+    The lock is a file beside it. A file that has all tables is opened without the lock.
+    """
+    assert database.database is not None
+    path = Path(database.database)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        if not _has_tables(database):
+            # On a file system without locks, processes collide, and repeat what has failed
+            with suppress(OSError, NotImplementedError):
+                stack.enter_context(FileLock(f"{path}.lock", timeout=SQLITE_TIMEOUT))
+        storage = _open_database(database, {"connect_args": {"timeout": SQLITE_TIMEOUT}})
+    _make_transactions_exclusive(storage)
+    return storage
+
+
+def _has_tables(database: URL) -> bool:
+    """Return whether Optuna has created all tables: it notes the revision of their schema last."""
+    engine = create_engine(database, connect_args={"timeout": SQLITE_TIMEOUT})
+    try:
+        with engine.connect() as connection:
+            return MigrationContext.configure(connection).get_current_revision() is not None
+    finally:
+        engine.dispose()
 
 
 def _open_database(database: URL, engine_kwargs: dict[str, Any]) -> RDBStorage:

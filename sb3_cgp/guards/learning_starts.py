@@ -17,13 +17,16 @@ class LearningStartsGuard(OffPolicyAlgorithm):
     """
     An algorithm that warns if ``learn`` does no gradient step, for ``learning_starts`` is too large.
 
+    Of several agents that the environments are divided among, it names those that learn nothing.
+
     It warns when the training starts. Where the length of the last episode decides, and episodes have no known limit, it warns
     when the training has ended. It does not warn of ``gradient_steps=0``, which says so itself.
 
     With ``verbose=1`` it prints how many steps are random.
     """
 
-    _has_trained: bool = False
+    # Gradient steps before this training
+    _n_updates_at_start: int = 0
     # The warning of this training, which is not repeated at its end
     _has_warned: bool = False
 
@@ -35,22 +38,13 @@ class LearningStartsGuard(OffPolicyAlgorithm):
         :param kwargs: the algorithm's own arguments
         :return: the trained model
         """
-        self._has_trained = self._has_warned = False
+        self._n_updates_at_start, self._has_warned = self._n_updates, False
         result = super().learn(*args, **kwargs)
         has_ended = self._num_timesteps_at_start < self._total_timesteps <= self.num_timesteps
-        if self._trains_by_episode and has_ended and not self._has_trained and not self._has_warned:
+        has_trained = self._n_updates > self._n_updates_at_start
+        if self._trains_by_episode and has_ended and not has_trained and not self._has_warned:
             self._warn_of_no_gradient_step(self.num_timesteps)
         return result
-
-    def train(self, *args: Any, **kwargs: Any) -> None:
-        """
-        Do gradient steps, see the algorithm's method.
-
-        :param args: the algorithm's own arguments
-        :param kwargs: the algorithm's own arguments
-        """
-        self._has_trained = True
-        super().train(*args, **kwargs)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
@@ -96,34 +90,43 @@ class LearningStartsGuard(OffPolicyAlgorithm):
         return isinstance(self.train_freq, TrainFreq) and self.train_freq.unit is TrainFrequencyUnit.EPISODE
 
     def _warn_of_no_gradient_step(self, last_timestep: int, certainty: str = "") -> None:
-        """Warn if the training ends at an environment step at which no gradient step has been due."""
+        """Warn if the training ends at an environment step at which no gradient step has been due, or none of some agent."""
+        starts = self._learning_starts_of_agents()
+        # The numbers of one agent, as the arguments are
+        last_timestep //= len(starts)
         # SB3 trains after a rollout that ends beyond `learning_starts`
-        if last_timestep > self.learning_starts or self.gradient_steps == 0:
+        late = [agent for agent, start in enumerate(starts) if last_timestep <= start]
+        if not late or self.gradient_steps == 0:
             return
         self._has_warned = True
-        # The numbers of one agent, as the arguments are
-        starts = self._learning_starts_of_agents()
-        last_timestep //= len(starts)
+        subject, whose = ("Nothing is learnt", "") if len(late) == len(starts) else (_nothing_is_learnt_by(late), "their ")
+        beyond = _range_in_words([starts[agent] for agent in late], "")
         # As in the sweeps of `benchmark`
         start = self._num_timesteps_at_start // len(starts)
         example = start + (last_timestep - start) // 10
         has_learnt = self._n_updates > 0 and start == 0
         continuing = ", or continue the training before this one with `reset_num_timesteps=False`" if has_learnt else ""
         warnings.warn(
-            f"Nothing is learnt: the training ends at environment step {last_timestep}{self._of_each_agent}{certainty}, and "
-            f"gradient steps begin after step learning_starts={min(starts)}. Give more `total_timesteps`, or a smaller "
-            f"`learning_starts`, such as {example}{continuing}.",
+            f"{subject}: the training ends at environment step {last_timestep}{self._of_each_agent}{certainty}, and "
+            f"{whose}gradient steps begin after step learning_starts={beyond}. "
+            f"Give more `total_timesteps`, or a smaller `learning_starts`, such as {example}{continuing}.",
             stacklevel=2,
         )
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_has_trained", "_has_warned"]
+        return [*super()._excluded_save_params(), "_n_updates_at_start", "_has_warned"]
 
 
 def _range_in_words(numbers: Sequence[int], thousands: str = ",") -> str:
     """Return the smallest and the largest of some numbers as text, with a separator of thousands."""
     low, high = (format(number, thousands) for number in (min(numbers), max(numbers)))
     return low if low == high else f"{low} to {high}"
+
+
+def _nothing_is_learnt_by(agents: Sequence[int]) -> str:
+    """Return a clause that names the agents that learn nothing."""
+    *others, last = map(str, agents)
+    return f"Agents {', '.join(others)} and {last} learn nothing" if others else f"Agent {last} learns nothing"
 
 
 def _longest_episode(env: VecEnv | None) -> int | None:

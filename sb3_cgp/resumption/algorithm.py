@@ -13,18 +13,19 @@ import torch as th
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 
 from sb3_cgp.common.files import whole_file
 from sb3_cgp.common.load_arguments import check_load_arguments
 from sb3_cgp.common.rules import require
-from sb3_cgp.resumption.callback_states import initial_attributes, iter_callbacks
-from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback, checkpoints_among
+from sb3_cgp.resumption.callback_states import iter_callbacks
+from sb3_cgp.resumption.callbacks import NO_STATE, TrainingCheckpointCallback, checkpoints_among
 from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.logs import continued_logger
 from sb3_cgp.resumption.model import ResumableModel
 from sb3_cgp.resumption.progress_bars import show_whole_training
 from sb3_cgp.resumption.replay_buffers import fill_replay_buffer
+from sb3_cgp.resumption.signals import StopSignals, end_training
 from sb3_cgp.resumption.state import begin_new_episode, check_fits
 from sb3_cgp.resumption.store import StateStore
 
@@ -79,7 +80,8 @@ class ResumableAlgorithm(ResumableModel):
         :param env: the environment, made as for the first call (if registered in Gym, can be str); its state is restored when
             ``learn`` starts
         :param device: Device on which the code should run.
-        :param kwargs: arguments to change in the model, see :meth:`load`
+        :param kwargs: arguments to change in the model, and those of :meth:`load` but for ``force_reset``, as the state of the
+            environment is restored
         :return: the model
         :raises FileNotFoundError: if the folder holds no state
         :raises ValueError: if all states are damaged, naming the files, or if the environment or an argument does not fit
@@ -112,6 +114,11 @@ class ResumableAlgorithm(ResumableModel):
         require(state["algorithm"] == cls.__name__, "path", str(store.folder), f"of {cls.__name__}, not {state['algorithm']}")
         saved = io.BytesIO(state.pop("model"))
         check_load_arguments(cls, saved, kwargs, "resume")
+        if "force_reset" in kwargs:
+            raise TypeError(
+                f"The value of `force_reset` is {kwargs['force_reset']!r}, but `{cls.__name__}.resume` takes no such argument."
+                " Leave it out: a resumed training restores the environment's state. `load` takes it, for a new episode."
+            )
         model = cls.load(saved, env, device, force_reset=False, **kwargs)
         assert model.env is not None
         check_fits(model, state)
@@ -191,11 +198,12 @@ class ResumableAlgorithm(ResumableModel):
         for bar in bars if self.resumption is not None else ():
             show_whole_training(bar, self)
         if self.resumption is not None and not checkpoints:
-            callback = CallbackList([callback, TrainingCheckpointCallback(**self.resumption["checkpoint"])])
+            self._added_checkpoint = TrainingCheckpointCallback(**self.resumption["checkpoint"])
+        if self._added_checkpoint is not None and not checkpoints:
+            # Also in the offline training of a policy that follows, which saves a state at its end
+            callback = CallbackList([callback, self._added_checkpoint])
             callback.init_callback(self)
         self.callback = callback
-        # A policy's offline training begins with callbacks that have counted
-        self._initial_callbacks = initial_attributes(callback) | dict(self._initial_callbacks)
         return callback
 
     def learn(self: SelfResumableAlgorithm, *args: Any, **kwargs: Any) -> SelfResumableAlgorithm:
@@ -210,6 +218,22 @@ class ResumableAlgorithm(ResumableModel):
         with self.as_training():
             return super().learn(*args, **kwargs)
 
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """
+        Collect experiences, see SB3's method, unless a signal ends a training in one of whose callbacks this one runs.
+
+        :param args: the arguments of SB3's method
+        :param kwargs: the arguments of SB3's method
+        :return: the numbers of steps and episodes, and whether to go on
+        :raises KeyboardInterrupt: after Ctrl-C
+        :raises SystemExit: after SIGTERM
+        """
+        asked = None if self._outer_signals is None else self._outer_signals.noted
+        # With states, this rollout's start saves one and ends the training
+        if asked is not None and all(each.path is None for each in self._checkpoints()):
+            end_training(asked, f"The training was interrupted: {NO_STATE}")
+        return super().collect_rollouts(*args, **kwargs)
+
     @contextmanager
     def as_training(self) -> Iterator[None]:
         """
@@ -218,12 +242,20 @@ class ResumableAlgorithm(ResumableModel):
         ``learn`` runs within it, and so must any other method that calls callbacks. Contexts may be nested. The outermost one
         also releases the folders of states, and removes the callbacks from the model.
         """
+        if self._n_nested_trainings == 0:
+            self._outer_signals = StopSignals.current()
         self._n_nested_trainings += 1
+        outer_callback = self.callback
         try:
             yield
         except Exception as error:
             # A terminal sends Ctrl-C to the environments' processes, too, which end by it
             if self._is_interrupted and any(isinstance(each, LOST_PROCESS) for each in (error, error.__cause__)):
+                self._stop_if_asked()
+            raise
+        except KeyboardInterrupt as error:
+            # Of a training within a callback: name the state of this one. Python's own, of a second Ctrl-C, has no arguments.
+            if error.args and any(each.signals.noted is not None for each in self._checkpoints()):
                 self._stop_if_asked()
             raise
         else:
@@ -233,11 +265,12 @@ class ResumableAlgorithm(ResumableModel):
             self._n_nested_trainings -= 1
             for each in self._checkpoints():
                 each.release()
+            # None in the end: callbacks hold environments and files, many of which can be neither copied nor pickled
+            self.callback = outer_callback
             if self._n_nested_trainings == 0:
-                # Callbacks hold environments and files, many of which can be neither copied nor pickled
-                self.callback = None
                 self._warned_of = frozenset()
                 self._initial_callbacks = {}
+                self._outer_signals = self._added_checkpoint = None
                 self.release_folders()
 
     def _checkpoints(self) -> list[TrainingCheckpointCallback]:
@@ -247,7 +280,7 @@ class ResumableAlgorithm(ResumableModel):
     @property
     def _is_interrupted(self) -> bool:
         """Whether Ctrl-C has been pressed."""
-        return any(each.signals.noted == signal.SIGINT for each in self._checkpoints())
+        return any(each.noted_signal == signal.SIGINT for each in self._checkpoints())
 
     def _stop_if_asked(self) -> None:
         for each in self._checkpoints():

@@ -9,10 +9,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
-from sb3_cgp.resumption.plain_data import equal_plain, plain_attributes, set_plain_attributes
+from sb3_cgp.resumption.fingerprints import fingerprint
+from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
 from sb3_cgp.resumption.replay_buffers import constructor_arguments
 
 State = dict[str, Any]
+Fingerprints = dict[str, bytes | None]
 # The attributes of every callback of SB3, which follow from the training
 COMMON = {"n_calls", "num_timesteps", "verbose", "locals", "globals", "parent"}
 
@@ -33,23 +35,27 @@ def iter_callbacks(callback: BaseCallback) -> list[BaseCallback]:
     return found
 
 
-def initial_attributes(callback: BaseCallback) -> dict[int, State]:
+def initial_attributes(callback: BaseCallback) -> dict[int, Fingerprints]:
     """
-    Return the attributes that callbacks have before a training, so that those that a training changes can be told.
+    Return the attributes that callbacks have when a training has started, so that those that its steps change can be told.
 
     :param callback: the training's callback
-    :return: plain data by the callback's ``id``, for each callback
+    :return: fingerprints of the attributes by name, for each callback by its ``id``
     """
-    return {id(each): plain_attributes(each, without=_unsaved(each)) for each in iter_callbacks(callback)}
+    return {id(each): _fingerprints(each) for each in iter_callbacks(callback)}
 
 
-def callback_states(callback: BaseCallback, training_env: VecEnv, initial: Mapping[int, State]) -> list[State]:
+def callback_states(callback: BaseCallback, training_env: VecEnv, initial: Mapping[int, Fingerprints]) -> list[State]:
     """
-    Return the states of all callbacks.
+    Return the states of all callbacks, and whether each has counted something since the training started.
+
+    A callback has counted if an attribute differs from that time: one of the constructor's arguments, too, or one that is not
+    plain data (:func:`~sb3_cgp.resumption.fingerprints.fingerprint`). One that declares its state has counted if this has
+    more than the counters of every callback.
 
     :param callback: the training's callback
     :param training_env: the training's environment, which is not saved with a callback
-    :param initial: the attributes before the training, by :func:`initial_attributes`
+    :param initial: the attributes at the training's start, by :func:`initial_attributes`
     :return: plain data, for each callback in the order of :func:`iter_callbacks`
     """
     return [_callback_state(each, training_env, initial.get(id(each), {})) for each in iter_callbacks(callback)]
@@ -111,7 +117,7 @@ def _restore_callback(callback: BaseCallback, state: State) -> None:
             restore_environment(getattr(callback, attribute), environment)
 
 
-def _callback_state(callback: BaseCallback, training_env: VecEnv, initial: State) -> State:
+def _callback_state(callback: BaseCallback, training_env: VecEnv, initial: Fingerprints) -> State:
     environments = {name: environment_state(env) for name, env in _environments(callback, training_env).items()}
     state: State = {"class": _class_name(callback), "environments": environments}
     if hasattr(callback, "get_training_state"):
@@ -119,8 +125,11 @@ def _callback_state(callback: BaseCallback, training_env: VecEnv, initial: State
         counted = own.keys() - COMMON if isinstance(own, dict) else own is not None
         return state | {"own": own, "has_counted": bool(counted)}
     attributes = plain_attributes(callback, without=_unsaved(callback))
-    changed = [name for name in attributes.keys() - COMMON if not equal_plain(attributes[name], initial.get(name))]
-    return state | {"attributes": attributes, "has_counted": bool(changed)}
+    return state | {"attributes": attributes, "has_counted": _fingerprints(callback) != initial}
+
+
+def _fingerprints(callback: BaseCallback) -> Fingerprints:
+    return {name: fingerprint(value) for name, value in vars(callback).items() if name not in COMMON}
 
 
 def _unsaved(callback: BaseCallback) -> set[str]:

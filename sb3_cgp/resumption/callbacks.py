@@ -6,12 +6,14 @@ from pathlib import Path
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cgp.common.rules import require, require_count
-from sb3_cgp.resumption.callback_states import iter_callbacks
+from sb3_cgp.resumption.callback_states import initial_attributes, iter_callbacks
 from sb3_cgp.resumption.model import ResumableModel
 from sb3_cgp.resumption.replay_buffers import check_replay_buffer
-from sb3_cgp.resumption.signals import StopSignals
+from sb3_cgp.resumption.signals import StopSignals, end_training
 from sb3_cgp.resumption.state import gather, restore, warn_of_unsaved
 from sb3_cgp.resumption.store import StateStore
+
+NO_STATE = "it has no state"
 
 
 class TrainingCheckpointCallback(BaseCallback):
@@ -24,8 +26,10 @@ class TrainingCheckpointCallback(BaseCallback):
 
     On SIGTERM, which a cluster's scheduler sends, and on Ctrl-C, the state is saved when the next rollout would start. Then
     the process exits with status 143, or ``learn`` raises ``KeyboardInterrupt``. A training without rollouts ends at its next
-    step without saving, as the state at its start was saved. A second signal has the effect that it has without this callback.
-    Of several such callbacks, the first one handles the signals.
+    step without saving: ``learn`` has saved the state at its start, and a user's call of ``train_policy`` is to be repeated. A
+    second signal has the effect that it has without this callback. Of several such callbacks, the first one handles the
+    signals. A training within a callback of another training ends first, and saves its state; the exception then ends the
+    other one within its step, whose last state remains.
 
     One training at a time can use the folder. It is locked from ``resume``, or the start of ``learn``, until ``learn`` ends.
 
@@ -35,7 +39,7 @@ class TrainingCheckpointCallback(BaseCallback):
     :param keep: how many states to keep, the newest ones
     :param verbose: Verbosity level: 0 for no output, 2 for indicating when a state is saved
     :raises ValueError: if an argument is out of its range, or, when the training starts, if the folder holds the states of
-        another training, or the replay buffer cannot be saved
+        another training, the model has no environment, or the replay buffer cannot be saved
     :raises FolderInUseError: when the training starts, if another training uses the folder
     :raises OSError: when the training starts or a state is due, if the folder cannot be written to
     """
@@ -55,6 +59,7 @@ class TrainingCheckpointCallback(BaseCallback):
         self._has_trained_without_rollouts = False
         # `learn` may end in the middle of a step, and a training without rollouts may follow
         self._is_within_step = False
+        self._has_noted_callbacks = False
         self.signals = StopSignals()
         # This callback and the training's others that save states, in the order in which SB3 calls them
         self._saving: list[TrainingCheckpointCallback] = []
@@ -77,6 +82,7 @@ class TrainingCheckpointCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._is_in_rollouts = self._rollout_is_over = self._has_trained_without_rollouts = False
+        self._has_noted_callbacks = False
         self._saved_at = self.num_timesteps
         if self.path is None:
             allowed = "TrainingCheckpointCallback(save_freq, path='run/state')"
@@ -84,6 +90,8 @@ class TrainingCheckpointCallback(BaseCallback):
                 f"No state of the training will be saved, as `path` is None; give a folder, as in {allowed}.", stacklevel=2
             )
             return
+        allowed = "set, by `set_env` or the argument `env` of `load`, where the training is saved"
+        require(self.model.env is not None, "env", None, allowed)
         check_replay_buffer(self.model._ensure_replay_buffer())
         self._store = StateStore(self._folder, self.keep)
         self._store.prepare()
@@ -99,10 +107,11 @@ class TrainingCheckpointCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         self._is_in_rollouts = True
         self._is_within_step = False
+        self._note_callbacks()
         self._restore_if_resumed()
         if self.path is None:
             return
-        asked = next((each for each in self._saving if each.signals.noted is not None), None)
+        asked = next((each for each in self._saving if each.noted_signal is not None), None)
         if asked is not None:
             if self.num_timesteps > self._saved_at or not self.has_state:
                 self._save()
@@ -114,6 +123,7 @@ class TrainingCheckpointCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         self._rollout_is_over = False
+        self._note_callbacks()
         if self._is_in_rollouts:
             self._is_within_step = True
         else:
@@ -150,6 +160,14 @@ class TrainingCheckpointCallback(BaseCallback):
         """
         self.n_calls, self.num_timesteps = state["n_calls"], state["num_timesteps"]
 
+    def _note_callbacks(self) -> None:
+        """Note the attributes of all callbacks, once they have been told that the training starts."""
+        if self.path is not None and not self._has_noted_callbacks:
+            self._has_noted_callbacks = True
+            assert self.model.callback is not None
+            # A policy's offline training begins with callbacks that have counted
+            self.model._initial_callbacks = initial_attributes(self.model.callback) | dict(self.model._initial_callbacks)
+
     def _restore_if_resumed(self) -> None:
         if self.model.resumption is not None:
             assert self.model.callback is not None
@@ -168,6 +186,12 @@ class TrainingCheckpointCallback(BaseCallback):
         if self.verbose >= 2:
             print(f"Saving the training state of step {self.num_timesteps} to {self.path}")
 
+    @property
+    def noted_signal(self) -> int | None:
+        """The signal that asks this training to end, or the one in one of whose callbacks it runs; None without one."""
+        outer = self.model._outer_signals
+        return outer.noted if self.signals.noted is None and outer is not None else self.signals.noted
+
     def stop_if_asked(self) -> None:
         """
         End the training if a signal has asked for it.
@@ -175,15 +199,25 @@ class TrainingCheckpointCallback(BaseCallback):
         :raises KeyboardInterrupt: after Ctrl-C
         :raises SystemExit: after SIGTERM
         """
-        if self.signals.noted is not None:
-            kept = f"its state of step {self._saved_at} is in {self.path}; `resume` continues it"
-            self.signals.end(f"The training was interrupted: {kept if self.has_state else 'it has no state'}")
+        number = self.noted_signal
+        if number is not None:
+            # An outer training's signal stays noted, for the outer one to end as well
+            self.signals.noted = None
+            end_training(number, f"The training was interrupted: {self._kept_state}")
+
+    @property
+    def _kept_state(self) -> str:
+        """The state that an interrupted training has, or the remedy."""
+        if self._has_trained_without_rollouts and self.model._n_nested_trainings == 1:
+            # Not by `learn`, which saves the state at the start, and repeats this training
+            return "`train_policy` saves no state before its end; call it again to go on from the actor as it is"
+        return f"its state of step {self._saved_at} is in {self.path}; `resume` continues it" if self.has_state else NO_STATE
 
     def release(self) -> None:
         """Restore the signals' handlers. Save no state until the next training starts, as this one may have failed."""
         self._rollout_is_over = self._has_trained_without_rollouts = False
         self._saving = []
-        self.signals.restore()
+        self.signals.release()
 
 
 def checkpoints_among(callback: BaseCallback) -> list[TrainingCheckpointCallback]:

@@ -9,11 +9,18 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_cgp.resumption.callback_states import Fingerprints
 from sb3_cgp.resumption.locks import FolderLock
+from sb3_cgp.resumption.signals import StopSignals
 
 State = dict[str, Any]
 # The attributes below, which describe a running training and are not part of SB3's zip
-UNSAVED = ("callback", "resumption", "saved_to", "_folder_locks", "_n_nested_trainings", "_warned_of", "_initial_callbacks")
+UNSAVED = (
+    *("callback", "resumption", "saved_to", "_folder_locks", "_n_nested_trainings", "_warned_of", "_initial_callbacks"),
+    *("_outer_signals", "_added_checkpoint"),
+)
+# Those that a copy does not have, as it does not take part in the running training
+UNCOPIED = ("callback", "_folder_locks", "_initial_callbacks", "_outer_signals", "_added_checkpoint")
 
 
 class ResumableModel(OffPolicyAlgorithm):
@@ -21,8 +28,8 @@ class ResumableModel(OffPolicyAlgorithm):
 
     # The callbacks of the training that is running
     callback: BaseCallback | None = None
-    # The attributes of the callbacks before the training, by `id`
-    _initial_callbacks: Mapping[int, State] = MappingProxyType({})
+    # The attributes of the callbacks at the training's start, by `id`
+    _initial_callbacks: Mapping[int, Fingerprints] = MappingProxyType({})
     # The loaded state, until the next `learn` has restored it
     resumption: State | None = None
     # The manifests' digests by state file, for each folder that holds states of this training
@@ -33,6 +40,10 @@ class ResumableModel(OffPolicyAlgorithm):
     _folder_locks: Mapping[Path, FolderLock] = MappingProxyType({})
     # A policy's offline training may run within `learn`
     _n_nested_trainings: int = 0
+    # The callback that saves states in a resumed training without one among its callbacks
+    _added_checkpoint: BaseCallback | None = None
+    # The signals of the training in one of whose callbacks this one runs
+    _outer_signals: StopSignals | None = None
     # The warnings about the training state that were given in this training
     _warned_of: frozenset[str] = frozenset()
 
@@ -88,10 +99,7 @@ class ResumableModel(OffPolicyAlgorithm):
         # Python has a method of this name since 3.11
         inherited = getattr(super(), "__getstate__", None)
         state = vars(self) if inherited is None else inherited()
-        # A copy does not take part in the running training, and has neither its callbacks nor its locks
-        kept = {
-            name: value for name, value in state.items() if name not in ("callback", "_folder_locks", "_initial_callbacks")
-        }
+        kept = {name: value for name, value in state.items() if name not in UNCOPIED}
         return kept | {"_n_nested_trainings": 0}
 
     def _excluded_save_params(self) -> list[str]:

@@ -103,26 +103,6 @@ def to_plain(value: Any) -> Any:
     raise NotPlainError(f"A {kind.__module__}.{kind.__qualname__} is not plain data.")
 
 
-def equal_plain(one: Any, other: Any) -> bool:
-    """
-    Return whether two pieces of plain data are equal. NaN equals NaN.
-
-    :param one: plain data
-    :param other: plain data
-    :return: whether they are of the same types and values
-    """
-    if type(one) is not type(other):
-        return False
-    if type(one) is np.ndarray:
-        is_float = one.dtype.kind in "fc"
-        return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=is_float)
-    if type(one) is dict:
-        return one.keys() == other.keys() and all(equal_plain(each, other[key]) for key, each in one.items())
-    if type(one) in (list, tuple):
-        return len(one) == len(other) and all(map(equal_plain, one, other))
-    return bool(one == other or (one != one and other != other))
-
-
 def from_plain(plain: Any, current: Any = None) -> Any:
     """
     Convert plain data back to the value that :func:`to_plain` copied.

@@ -4,7 +4,7 @@ import os
 import signal
 import threading
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn, Optional
 
 MESSAGE = b"\nThe training saves its state and stops when this rollout is over. Press Ctrl-C again to stop at once.\n"
 
@@ -16,6 +16,9 @@ class StopSignals:
     A second signal has the effect that it has without this object.
     """
 
+    # The object of the training in progress. A training within one of its callbacks ends by what this object notes.
+    _current: ClassVar[Optional["StopSignals"]] = None
+
     def __init__(self) -> None:
         self.noted: int | None = None
         self._previous: dict[int, Any] = {}
@@ -26,12 +29,13 @@ class StopSignals:
         Handle the signals, until :meth:`restore`.
 
         It has no effect in another thread than the main one, where Python sets no handlers, on a signal that is ignored or
-        that another such object handles, and on SIGINT if it has another handler than Python's own.
+        that another such object handles, on SIGINT if it has another handler than Python's own, and after a noted signal.
         """
-        self.noted = None
-        if threading.current_thread() is not threading.main_thread():
+        if threading.current_thread() is not threading.main_thread() or self.noted is not None:
             return
         self._process = os.getpid()
+        if StopSignals.current() is None:
+            StopSignals._current = self
         for number in (signal.SIGTERM, signal.SIGINT):
             handler = signal.getsignal(number)
             is_watched = isinstance(getattr(handler, "__self__", None), StopSignals)
@@ -47,18 +51,18 @@ class StopSignals:
                 signal.signal(number, handler)
         self._previous = {}
 
-    def end(self, reason: str) -> NoReturn:
-        """
-        End the training as the noted signal asks.
+    def release(self) -> None:
+        """Restore the handlers, and forget the noted signal, at the end of the training."""
+        self.restore()
+        self.noted = None
+        if StopSignals._current is self:
+            StopSignals._current = None
 
-        :param reason: the message of the ``KeyboardInterrupt``
-        :raises KeyboardInterrupt: after SIGINT
-        :raises SystemExit: after SIGTERM, with the status 143
-        """
-        number, self.noted = self.noted, None
-        if number == signal.SIGINT:
-            raise KeyboardInterrupt(reason)
-        raise SystemExit(128 + signal.SIGTERM)
+    @classmethod
+    def current(cls) -> Optional["StopSignals"]:
+        """Return the object of the training in progress in the main thread of this process; None in another thread."""
+        current, is_main = cls._current, threading.current_thread() is threading.main_thread()
+        return current if current is not None and is_main and current._process == os.getpid() else None
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.restore()
@@ -70,3 +74,17 @@ class StopSignals:
         if number == signal.SIGINT:
             # `print` in a handler may interrupt another `print`
             os.write(2, MESSAGE)
+
+
+def end_training(number: int, reason: str) -> NoReturn:
+    """
+    End a training as a signal asks.
+
+    :param number: the signal
+    :param reason: the message of the ``KeyboardInterrupt``
+    :raises KeyboardInterrupt: after SIGINT
+    :raises SystemExit: after SIGTERM, with the status 143
+    """
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt(reason)
+    raise SystemExit(128 + signal.SIGTERM)
