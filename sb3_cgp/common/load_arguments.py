@@ -36,7 +36,9 @@ def check_load_arguments(
         nor an attribute of a model. The error names the argument, its value and the nearest name that is allowed.
     """
     own = constructor_argument_names(algorithm) - {"self"}
-    unknown = [name for name in arguments if name not in own | PARAMETERS]
+    # `resume` gives this one itself
+    parameters = PARAMETERS - {"force_reset"} if method == "resume" else PARAMETERS
+    unknown = [name for name in arguments if name not in own | parameters]
     if not unknown:
         return
     saved_attributes = saved_attribute_names(saved)
@@ -46,11 +48,11 @@ def check_load_arguments(
     for name in (name for name in unknown if name not in attributes):
         public = {each for each in attributes if not each.startswith("_")}
         usage = (
-            f"It takes {', '.join(sorted(PARAMETERS))}, the constructor's arguments {', '.join(sorted(own))}, and the "
+            f"It takes {', '.join(sorted(parameters))}, the constructor's arguments {', '.join(sorted(own))}, and the "
             "names of attributes of the model."
         )
         called = f"{algorithm.__name__}.{method}"
-        raise unknown_argument(called, name, arguments[name], PARAMETERS | own | public, usage=usage)
+        raise unknown_argument(called, name, arguments[name], parameters | own | public, usage=usage)
 
 
 def misspelt_custom_objects(saved: SavedModel, names: Iterable[str]) -> dict[str, str]:
