@@ -82,6 +82,9 @@ ifneq ($(filter resume,$(MAKECMDGOALS)),)
 ifeq ($(strip $(RUN)),)
 $(error Name the run's folder, as in: make resume RUN=logs/cgp/Pendulum-v1_1)
 endif
+ifeq ($(shell test -d "$(RUN)" && echo yes),)
+$(error There is no folder $(RUN): give the folder of a run, as in: make resume RUN=logs/cgp/Pendulum-v1_1)
+endif
 endif
 
 resume: $(INSTALLED) ## continue an interrupted run of CGP to its end, and report: make resume RUN=logs/cgp/Pendulum-v1_1

@@ -138,6 +138,15 @@ def test_statistics_that_are_not_there_are_missed(tmp_path):
     loaded = CGP.load(tmp_path / "model")
     with pytest.raises(ValueError, match=r"`env` is None, but must be wrapped in VecNormalize .* `set_env`"):
         loaded.export(tmp_path / "export")
+    new = VecNormalize(model.get_env().venv)
+    for training in (True, False):
+        new.training = training
+        loaded.set_env(new)
+        with pytest.raises(ValueError, match=r"statistics that were saved with the model, not new ones: `load\(path, env="):
+            loaded.export(tmp_path / "export")
+    # As `learn` advises for raw observations
+    loaded.set_env(VecNormalize(model.get_env().venv, training=False, clip_obs=np.inf))
+    loaded.export(tmp_path / "raw")
     loaded.set_env(model.get_env())
     loaded.export(tmp_path / "export")
     assert CGP.load_weights(tmp_path / "export").network.is_normalized

@@ -61,6 +61,7 @@ def test_a_misspelt_argument_of_the_constructor_is_refused_with_the_nearest_one(
         ("eval_freq", "Give SB3's `EvalCallback`"),
         ("n_sampled_goal", "Give it in `replay_buffer_kwargs`"),
         ("gradient_clip", "gradients are not clipped"),
+        ("noise_std", "give `action_noise="),
         ("n_epochs", "It takes action_noise"),
     ],
 )
@@ -69,8 +70,8 @@ def test_an_argument_that_belongs_elsewhere_is_sent_there(name, remedy):
         make(**{name: 3})
 
 
-def test_the_first_of_several_unknown_arguments_is_named():
-    with pytest.raises(TypeError, match="The value of `netarch` is 1"):
+def test_of_several_unknown_arguments_the_first_has_a_remedy_and_the_others_are_named():
+    with pytest.raises(TypeError, match=r"The value of `netarch` is 1, .* It does not take `foo`, `bar` either\."):
         make(netarch=1, foo=2, bar=3)
 
 
@@ -288,6 +289,7 @@ def test_valid_arguments_of_the_policy_are_taken(arguments):
         (None, "only `load` needs none"),
         (3, "the name of a registered environment"),
         ([gym.make], "the name of a registered environment"),
+        (lambda: gym.make("Pendulum-v1"), re.escape("which `make_vec_env(function)` makes")),
         (gym.Wrapper, re.escape("write `Wrapper(...)`, with its arguments")),
         (gym.make_vec("Pendulum-v1", num_envs=2), re.escape("which SB3's `make_vec_env(name, n_envs=N)` makes")),
     ],

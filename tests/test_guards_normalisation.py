@@ -16,7 +16,9 @@ from stable_baselines3.common.vec_env import (
     VecTransposeImage,
 )
 
-FORGOTTEN = r"`env` is .* must normalise observations, .* `model.set_env\(VecNormalize.load\(path, env\)\)`"
+FORGOTTEN = (
+    r"`env` is .* must normalise observations, .* `load\(path, env=VecNormalize.load\(statistics, env\)\)`, or `set_env`"
+)
 ADDED = "learnt from observations that were not normalised, and `env` normalises them now"
 NEW = "the `VecNormalize` of `env` has new statistics"
 

@@ -165,10 +165,12 @@ def test_an_interrupted_training_says_how_it_is_continued(has_state: bool, clone
 
 
 def test_resume_goes_on_with_the_named_run_and_reports_it(clone: Clone) -> None:
+    run = clone.folder / "my logs/cgp/Ant-v5_2"
+    run.mkdir(parents=True)
     calls, ended = clone.make("resume", "RUN=my logs/cgp/Ant-v5_2")
     assert ended.returncode == 0, ended.stderr
     assert calls[-2:] == ["-m sb3_cgp.zoo.resume <my logs/cgp/Ant-v5_2>", "-m benchmark.report --run <my logs/cgp/Ant-v5_2>"]
-    calls, ended = clone.make("resume", "RUN=logs/cgp/Ant-v5_2", FAIL="sb3_cgp.zoo.resume")
+    calls, ended = clone.make("resume", f"RUN={run}", FAIL="sb3_cgp.zoo.resume")
     assert ended.returncode != 0
     assert not starting(calls, "-m benchmark.report")
 
@@ -186,9 +188,15 @@ def test_resume_without_a_run_says_how_to_name_one(clone: Clone) -> None:
     assert not starting(calls, "-m sb3_cgp")
 
 
+def test_resume_of_a_missing_run_says_so_before_anything_is_installed(clone: Clone) -> None:
+    calls, ended = clone.make("resume", "RUN=logs/cgp/Ant-v5_2")
+    assert (calls, ended.returncode) == ([], 2)
+    assert "There is no folder logs/cgp/Ant-v5_2" in ended.stderr
+
+
 def test_every_goal_installs_its_extra_once(clone: Clone) -> None:
     goals = ("train", "sweeps", "docs", "test", "train", "test-slow", "sweeps", "docs", "resume")
-    installed = [starting(clone.make(goal, "RUN=logs/cgp/Ant-v5_2")[0], "-m pip") for goal in goals]
+    installed = [starting(clone.make(goal, "RUN=.")[0], "-m pip") for goal in goals]
     extras = [[call.partition("-e ")[2] for call in calls] for calls in installed]
     assert extras == [[".[zoo]"], [".[sweeps]"], [".[docs]"], [".[tests]"], [], [], [], [], []]
 

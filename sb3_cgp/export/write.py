@@ -43,6 +43,7 @@ from sb3_cgp.export.policy import ExportedPolicy
 from sb3_cgp.export.read import PURPOSE, build
 
 # Of files, which a user may name in place of the folder
+WITH_STATISTICS = "`load(path, env=VecNormalize.load(statistics, env))`"
 SUFFIXES = (".onnx", ".safetensors", ".json", ".zip")
 
 # Observations at which an export is compared with `predict`
@@ -112,11 +113,16 @@ def _normalizer(model: ExportableModel) -> VecNormalize | None:
         "env",
         model.env,
         "wrapped in VecNormalize with its statistics, as the environment was that the model learnt from: "
-        "use `set_env` before exporting",
+        f"{WITH_STATISTICS} or `set_env` before exporting",
     )
     if not normalizes:
         return None
     assert normalizer is not None
+    statistics = normalizer.obs_rms.values() if isinstance(normalizer.obs_rms, dict) else [normalizer.obs_rms]
+    # SB3's initial count is below 1. Without a bound, new statistics leave observations as they are, as may be intended.
+    is_new = min(each.count for each in statistics) < 1.0 and bool(np.isfinite(normalizer.clip_obs))
+    allowed = f"one with the statistics that were saved with the model, not new ones: {WITH_STATISTICS}"
+    require(not is_new or not model._learnt_normalized, "env", model.env, allowed)
     space = normalizer.venv.observation_space
     require(
         space == model.observation_space,

@@ -76,6 +76,8 @@ class ConstructionGuard(OffPolicyAlgorithm):
             remedy = f": write `{env.__name__}(...)`, with its arguments"
         elif isinstance(env, gym.vector.VectorEnv):
             remedy = ", which SB3's `make_vec_env(name, n_envs=N)` makes"
+        elif callable(env) and not hasattr(env, "step"):
+            remedy = ", which `make_vec_env(function)` makes"
         require(not remedy and (isinstance(env, str) or hasattr(env, "step")), "env", env, f"{ENVIRONMENT}{remedy}")
         return super()._wrap_env(maybe_make_env(env, verbose), verbose, monitor_wrapper)
 

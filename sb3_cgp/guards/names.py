@@ -41,6 +41,7 @@ ELSEWHERE = {
     **dict.fromkeys(("n_timesteps", "timesteps"), "Give `total_timesteps` to `learn`."),
     **dict.fromkeys(("n_envs", "env_kwargs"), "Give it to SB3's `make_vec_env`, and the result as `env`."),
     **dict.fromkeys(("eval_env", "eval_freq"), "Give SB3's `EvalCallback` to `learn`, as `callback`."),
+    **dict.fromkeys(("noise_type", "noise_std"), "Outside of rl_zoo3, give `action_noise=NormalActionNoise(mean, std)`."),
     **dict.fromkeys(("n_sampled_goal", "goal_selection_strategy", "copy_info_dict"), "Give it in `replay_buffer_kwargs`."),
     "lr": "Did you mean `learning_rate`?",
     "actor_lr": "Did you mean `actor_learning_rate`?",
@@ -78,10 +79,12 @@ def check_names(called: str, given: Mapping[str, Any], known: set[str], remedies
     :param remedies: sentences for names that are known to be given by mistake
     :raises TypeError: naming the first one, its value and the remedy
     """
-    public = {name for name in known if not name.startswith("_")}
-    for name, value in given.items():
-        if name not in known:
-            raise unknown_argument(called, name, value, public, remedies, cutoff=SIMILAR)
+    unknown = [name for name in given if name not in known]
+    if unknown:
+        public = {name for name in known if not name.startswith("_")}
+        error = unknown_argument(called, unknown[0], given[unknown[0]], public, remedies, cutoff=SIMILAR)
+        others = ", ".join(f"`{name}`" for name in unknown[1:])
+        raise TypeError(f"{error} It does not take {others} either.") if others else error
 
 
 @contextmanager

@@ -66,9 +66,9 @@ class NormalisationGuard(OffPolicyAlgorithm):
         if self._learnt_normalized and not self._normalises:
             raise ValueError(
                 f"The value of `env` is {self.env!r}, but must normalise observations, as the model has learnt from "
-                "normalised ones: use `model.set_env(VecNormalize.load(path, env))`, with the statistics that were saved with "
-                "the model. If raw observations are intended, use `VecNormalize(env, training=False, clip_obs=float('inf'))`, "
-                "whose new statistics leave observations as they are."
+                "normalised ones: use `load(path, env=VecNormalize.load(statistics, env))`, or `set_env`, with the statistics "
+                "that were saved with the model. If raw observations are intended, use `VecNormalize(env, training=False, "
+                "clip_obs=float('inf'))`, whose new statistics leave observations as they are."
             )
         if self._learnt_normalized is False and self._normalises:
             warnings.warn(
@@ -94,8 +94,8 @@ class NormalisationGuard(OffPolicyAlgorithm):
         if is_new:
             warnings.warn(
                 "The model has learnt from normalised observations, and the `VecNormalize` of `env` has new statistics: the "
-                "networks see other observations than before. Use `model.set_env(VecNormalize.load(path, env))`, with the "
-                "statistics that were saved with the model.",
+                "networks see other observations than before. Use `load(path, env=VecNormalize.load(statistics, env))`, with "
+                "the statistics that were saved with the model.",
                 stacklevel=2,
             )
 

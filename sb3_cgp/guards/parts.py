@@ -16,6 +16,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.spaces import check_action_space
+from sb3_cgp.guards.contents import check_contents
 
 
 class PartsGuard(OffPolicyAlgorithm):
@@ -51,6 +52,7 @@ class PartsGuard(OffPolicyAlgorithm):
         check_action_noise_shape(self.action_noise, self.action_space)
         if self.replay_buffer is not None:
             check_replay_buffer(self.replay_buffer, self)
+            check_contents(self.replay_buffer)
         result = super()._setup_learn(*args, **kwargs)
         if self.replay_buffer is None:
             raise ValueError(
