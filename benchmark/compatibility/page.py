@@ -37,13 +37,14 @@ NOTES = """\
 - **trains**: CGP trained for 220 steps, was saved and loaded, and acted as before, within the bounds.
 - **resumes**: an interrupted training was compared with an uninterrupted one. "bit for bit": networks, optimizers, replay
   buffer and counters are identical at the end. "from a new episode": the state of the environment cannot be restored, and a
-  warning names its classes ([what helps](environments.md#environments-of-other-packages)). "differs": without a warning.
+  warning names its classes ([what helps](environments.md#environments-of-other-packages)).
 - **exports**: in brackets, the largest difference between the actions of `predict` and of the exported policy, as a share of
   the action space's width. Where observations are float64, so are the exported policy's inputs.
-- **steps/s**: steps per second of processor time, on one thread, with a gradient step after each. In brackets: the environment
-  alone.
-- **learns**: the mean return of 20 episodes, and how many are successful: by random actions → after a training of that many
-  steps (arguments: `benchmark/compatibility/packages.py`).
+- **steps/s**: steps of all environments together per second of processor time, on one thread, with a gradient step of the
+  default networks (256 units) after each step. In brackets: the environment alone.
+- **learns**: the mean return of 20 episodes, and how many are successful: by random actions → after one training of that many
+  steps, with networks of 64 units (arguments: `benchmark/compatibility/packages.py`). It is short: it shows whether returns
+  rise, and not which returns the task allows.
 - "–": not tested, or interrupted.
 """
 REPEAT = """\
