@@ -100,7 +100,8 @@ def naming_policy_argument(model: OffPolicyAlgorithm) -> Iterator[None]:
     try:
         yield
     except TypeError as error:
-        found = re.fullmatch(r"(.+)\.__init__\(\) got an unexpected keyword argument '(\w+)'", str(error))
+        # Python 3.13 adds a suggestion to it
+        found = re.match(r"(.+?)\.__init__\(\) got an unexpected keyword argument '(\w+)'", str(error))
         policy, algorithm = model.policy_class, type(model)
         # Other constructors within the policy's, such as those of features extractors, have arguments of the same names
         if found is None or found[1] not in {each.__qualname__ for each in policy.__mro__}:
