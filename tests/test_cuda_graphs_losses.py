@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 from graph_models import make_model
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cgp.fast.recorded_optimizers import LossWatch
 
@@ -41,10 +42,17 @@ def test_a_nan_loss_is_skipped_by_the_device_and_raised_when_it_is_read(stand_in
 
 
 def test_a_nan_loss_ends_the_training_at_the_next_look_at_it(stand_in):
+    class Spoil(BaseCallback):
+        def _on_training_start(self):
+            # After the buffer has been checked
+            self.model.replay_buffer.rewards[:] = np.inf
+
+        def _on_step(self):
+            return True
+
     model = make_model().learn(60)
-    model.replay_buffer.rewards[:] = np.inf
     with pytest.raises(ValueError, match="critic loss was NaN or infinite at gradient step 31"):
-        model.learn(5, reset_num_timesteps=False)
+        model.learn(5, callback=Spoil(), reset_num_timesteps=False)
 
 
 def test_a_training_state_has_the_losses_of_recorded_steps_in_its_log(stand_in):

@@ -133,8 +133,7 @@ class CGP(OffPolicyAlgorithm):
     def _setup_model(self) -> None:
         # Not in the constructor: `load` sets the saved arguments after it, and calls this method then
         check_arguments(self, tuple(POLICY_LOSSES))
-        allowed = "a subclass of sb3_cgp.CGPPolicy: another algorithm's model is loaded by that algorithm"
-        require(issubclass(self.policy_class, CGPPolicy), "policy", self.policy_class, allowed)
+        require(issubclass(self.policy_class, CGPPolicy), "policy", self.policy_class, "a subclass of sb3_cgp.CGPPolicy")
         super()._setup_model()
         self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target

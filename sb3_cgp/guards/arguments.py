@@ -86,7 +86,13 @@ class ArgumentGuard(OffPolicyAlgorithm):
             for name, similar in misspelt_custom_objects(path, custom_objects).items():
                 message = f"custom_objects[{name!r}] has no effect, as the saved model has no such attribute: {similar!r}?"
                 warnings.warn(message, stacklevel=2)
-        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        try:
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except ValueError as error:
+            if not str(error).startswith("The value of `policy` is"):
+                raise
+            # The policy is the saved one
+            raise ValueError(f"{error} Load a model of another algorithm by that algorithm's class.") from error
 
 
 def as_total_timesteps(value: Any) -> int:

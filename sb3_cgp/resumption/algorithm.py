@@ -113,12 +113,12 @@ class ResumableAlgorithm(ResumableModel):
         _, state = store.load()
         require(state["algorithm"] == cls.__name__, "path", str(store.folder), f"of {cls.__name__}, not {state['algorithm']}")
         saved = io.BytesIO(state.pop("model"))
-        check_load_arguments(cls, saved, kwargs, "resume")
         if "force_reset" in kwargs:
             raise TypeError(
                 f"The value of `force_reset` is {kwargs['force_reset']!r}, but `{cls.__name__}.resume` takes no such argument."
                 " Leave it out: a resumed training restores the environment's state. `load` takes it, for a new episode."
             )
+        check_load_arguments(cls, saved, kwargs, "resume")
         model = cls.load(saved, env, device, force_reset=False, **kwargs)
         assert model.env is not None
         check_fits(model, state)
