@@ -1,5 +1,6 @@
 """The packages whose environments are tested: what pip installs, how environments are made, and what to know. Data alone."""
 
+from dataclasses import replace
 from typing import Any
 
 from benchmark.compatibility.package_types import Environment, Learning, Package, made
@@ -262,7 +263,8 @@ PACKAGES = (
                 "Pendulum-v1",
                 ENVPOOL,
                 wrappers="an adapter",
-                learning=PENDULUM,
+                # Two environments share a step
+                learning=replace(PENDULUM, arguments=PENDULUM.arguments | dict(gradient_steps=-1)),
                 notes=("The adapter resets environments as SB3 expects, and keeps the last observation of an episode.",),
             ),
         ),
