@@ -16,6 +16,7 @@ from stable_baselines3.td3.policies import Actor
 from sb3_cgp.common.extras import import_from_extra
 from sb3_cgp.common.files import replace_all
 from sb3_cgp.common.rules import require
+from sb3_cgp.common.statistics import WITH_STATISTICS, count_observations
 from sb3_cgp.common.version import __version__
 from sb3_cgp.export.boxes import (
     KEYS_ALLOWED,
@@ -43,7 +44,6 @@ from sb3_cgp.export.policy import ExportedPolicy
 from sb3_cgp.export.read import PURPOSE, build
 
 # Of files, which a user may name in place of the folder
-WITH_STATISTICS = "`load(path, env=VecNormalize.load(statistics, env))`"
 SUFFIXES = (".onnx", ".safetensors", ".json", ".zip")
 
 # Observations at which an export is compared with `predict`
@@ -118,9 +118,8 @@ def _normalizer(model: ExportableModel) -> VecNormalize | None:
     if not normalizes:
         return None
     assert normalizer is not None
-    statistics = normalizer.obs_rms.values() if isinstance(normalizer.obs_rms, dict) else [normalizer.obs_rms]
-    # SB3's initial count is below 1. Without a bound, new statistics leave observations as they are, as may be intended.
-    is_new = min(each.count for each in statistics) < 1.0 and bool(np.isfinite(normalizer.clip_obs))
+    # Without a bound, new statistics leave observations as they are, as may be intended
+    is_new = count_observations(normalizer) < 1.0 and bool(np.isfinite(normalizer.clip_obs))
     allowed = f"one with the statistics that were saved with the model, not new ones: {WITH_STATISTICS}"
     require(not is_new or not model._learnt_normalized, "env", model.env, allowed)
     space = normalizer.venv.observation_space

@@ -61,9 +61,10 @@ def suggests_names(method: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(method)
     def checked(*args: P.args, **kwargs: P.kwargs) -> T:
-        owner: type[Any] = type(args[0])
-        in_constructor = dict.fromkeys(constructor_argument_names(owner), "Give it to the constructor.")
-        check_names(f"{owner.__name__}.{method.__name__}", kwargs, known, in_constructor)
+        if kwargs.keys() - known:
+            owner: type[Any] = type(args[0])
+            in_constructor = dict.fromkeys(constructor_argument_names(owner), "Give it to the constructor.")
+            check_names(f"{owner.__name__}.{method.__name__}", kwargs, known, in_constructor)
         return method(*args, **kwargs)
 
     return checked
@@ -77,7 +78,7 @@ def check_names(called: str, given: Mapping[str, Any], known: set[str], remedies
     :param given: the keyword arguments
     :param known: the names that are allowed
     :param remedies: sentences for names that are known to be given by mistake
-    :raises TypeError: naming the first one, its value and the remedy
+    :raises TypeError: naming the first one, its value and the remedy, and the others
     """
     unknown = [name for name in given if name not in known]
     if unknown:

@@ -8,6 +8,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, VecTransposeImage, unwrap_vec_normalize
 
+from sb3_cgp.common.statistics import WITH_STATISTICS, count_observations
+
 
 class NormalisationGuard(OffPolicyAlgorithm):
     """
@@ -66,7 +68,7 @@ class NormalisationGuard(OffPolicyAlgorithm):
         if self._learnt_normalized and not self._normalises:
             raise ValueError(
                 f"The value of `env` is {self.env!r}, but must normalise observations, as the model has learnt from "
-                "normalised ones: use `load(path, env=VecNormalize.load(statistics, env))`, or `set_env`, with the statistics "
+                f"normalised ones: use {WITH_STATISTICS}, or `set_env`, with the statistics "
                 "that were saved with the model. If raw observations are intended, use `VecNormalize(env, training=False, "
                 "clip_obs=float('inf'))`, whose new statistics leave observations as they are."
             )
@@ -83,8 +85,7 @@ class NormalisationGuard(OffPolicyAlgorithm):
         normalizer = self._vec_normalize_env
         if not self._learnt_normalized or normalizer is None or not normalizer.norm_obs:
             return
-        statistics = normalizer.obs_rms
-        count = min(each.count for each in statistics.values()) if isinstance(statistics, dict) else statistics.count
+        count = count_observations(normalizer)
         if normalizer.training:
             # The steps of this training, its reset, and SB3's initial count
             is_new = count <= self.num_timesteps - self._num_timesteps_at_start + self.n_envs + 1e-3
@@ -94,7 +95,7 @@ class NormalisationGuard(OffPolicyAlgorithm):
         if is_new:
             warnings.warn(
                 "The model has learnt from normalised observations, and the `VecNormalize` of `env` has new statistics: the "
-                "networks see other observations than before. Use `load(path, env=VecNormalize.load(statistics, env))`, with "
+                f"networks see other observations than before. Use {WITH_STATISTICS}, with "
                 "the statistics that were saved with the model.",
                 stacklevel=2,
             )
