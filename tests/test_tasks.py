@@ -15,13 +15,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 import benchmark.tasks  # noqa: F401
 from benchmark.sweeps.experiments import included_sweeps, load_sweep
 from benchmark.tasks.landscape import KnownMaxima
-from benchmark.tasks.registration import ORIGINALS
+from benchmark.tasks.registration import LANDSCAPES, ORIGINALS
 from benchmark.tasks.zones import AllowedZones, unit_radius
 from sb3_cgp import CEM, CGP
 from sb3_cgp.resumption.environments import environment_state, restore_environment
 
 RESTRICTED = [f"Restricted{original}" for original in ORIGINALS]
-TASKS = [*RESTRICTED, "KnownMaxima-v0"]
+TASKS = [*RESTRICTED, *LANDSCAPES]
 
 
 class Recorder(gym.Env):
@@ -228,7 +228,8 @@ def landscape_score(env):
 
 @pytest.mark.parametrize("action_dim", [1, 3])
 def test_rewards_of_the_landscape(action_dim):
-    env = gym.make("KnownMaxima-v0", action_dim=action_dim)
+    env = gym.make({1: "KnownMaxima-v0", 3: "KnownMaxima3D-v0"}[action_dim])
+    assert env.action_space.shape == (action_dim,)
     env.reset(seed=0)
     at_higher, at_lower = np.full(action_dim, 0.7, np.float32), np.full(action_dim, -0.4, np.float32)
     assert env.step(at_higher)[1:4] == (pytest.approx(1.0), True, False)
@@ -332,11 +333,11 @@ def test_actors_by_gradients_climb_to_the_lower_maximum_and_cgp_imitates_the_hig
 def test_sweep_of_the_tasks():
     names = included_sweeps("e10")
     sweeps = [load_sweep(name) for name in names]
-    assert sorted(task for sweep in sweeps for task in sweep.file.tasks) == sorted(RESTRICTED)
+    assert sorted(task for sweep in sweeps for task in sweep.file.tasks) == sorted(TASKS)
     for sweep in sweeps:
         assert sweep.methods.keys() == {"CGP-Online", "CGP-Light", "CEM", "QGP-Online", "TD3", "SAC"}
         assert sweep.seeds == [0, 1, 2, 3, 4]
         assert sweep.file.steps == 20 * sweep.file.evaluation_interval
         assert all(run.gym_packages == ["benchmark.tasks"] for run in sweep.runs())
         (width,) = {run.hyperparams["policy_kwargs"] for run in sweep.runs()}
-        assert width == f"dict(net_arch={[64, 64] if sweep.file.steps == 20_000 else [256, 256]})"
+        assert width == f"dict(net_arch={[256, 256] if sweep.file.steps == 100_000 else [64, 64]})"

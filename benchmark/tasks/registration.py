@@ -10,6 +10,9 @@ from benchmark.tasks.zones import AllowedZones
 PREFIX = "Restricted"
 ORIGINALS = ("Pendulum-v1", "Reacher-v5", "Hopper-v5", "HalfCheetah-v5")
 
+# Action dimensions of the tasks of one step, by their ids
+LANDSCAPES = {"KnownMaxima-v0": 1, "KnownMaxima2D-v0": 2, "KnownMaxima3D-v0": 3, "KnownMaxima6D-v0": 6}
+
 
 def register_tasks() -> None:
     """Register the tasks. The time limits of the original tasks hold, and stay the outermost wrapper."""
@@ -20,7 +23,8 @@ def register_tasks() -> None:
             max_episode_steps=gym.spec(original).max_episode_steps,
             kwargs={"original": original},
         )
-    gym.register(id="KnownMaxima-v0", entry_point="benchmark.tasks.landscape:KnownMaxima")
+    for name, action_dim in LANDSCAPES.items():
+        gym.register(id=name, entry_point="benchmark.tasks.landscape:KnownMaxima", kwargs={"action_dim": action_dim})
 
 
 def make_restricted(original: str, levels: int = 3, share: float = 0.5, **kwargs: Any) -> gym.Env:
