@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -24,7 +25,8 @@ from benchmark.reporting.comparisons import (
 )
 from benchmark.reporting.estimates import Estimate, welch
 from benchmark.reporting.light import light_section
-from benchmark.reporting.scores import Study, longest, read_study, score_table
+from benchmark.reporting.scores import Study, read_study, score_table
+from benchmark.reporting.side_runs import without_side_runs
 
 
 def study(folder: Path, records: list[Record], name: str = "sweep") -> Study:
@@ -201,5 +203,31 @@ def test_longer_runs_replace_shorter_ones_only_if_they_have_all_their_methods(tm
         return study(tmp_path, records, f"{steps}")
 
     trial, whole, long = of(["TD3", "SAC"], 250), of(["CGP-Light", "SAC", "TD3"], 500), of(["CGP-Light", "TD3"], 1_000)
-    assert [kept.name for kept in longest([trial, whole, long])] == ["500", "1000"]
-    assert isinstance(score_table(longest([trial, whole, long])), pd.DataFrame)
+    assert [kept.name for kept in without_side_runs([trial, whole, long])] == ["500", "1000"]
+    assert isinstance(score_table(without_side_runs([trial, whole, long])), pd.DataFrame)
+
+
+@pytest.mark.parametrize(
+    ("methods", "changed", "kept"),
+    [
+        (["CGP-Light"], {"policy_delay": 2}, False),
+        # The same hyperparameters: further runs of the same experiment
+        (["CGP-Light"], {}, True),
+        # None of them is a part of the other
+        (["CGP-Light", "TD3"], {"policy_delay": 2}, True),
+    ],
+)
+def test_a_variation_of_some_methods_does_not_count_as_the_experiment(
+    tmp_path: Path, methods: list[str], changed: dict[str, Any], kept: bool
+) -> None:
+    def of(name: str, chosen: list[str], value: float, further: dict[str, Any]) -> Study:
+        whole = study(tmp_path, runs(lambda *_: value, chosen, seeds=range(4)), name)
+        whole.facts["configurations"] = {method: {"batch_size": 128, **further} for method in chosen}
+        return whole
+
+    main = of("main", ["CGP-Light", "TD3"], 1.0, {})
+    variation = of("variation", methods, 0.0, changed)
+    for order in ([main, variation], [variation, main]):
+        found = without_side_runs(order)
+        assert {each.name for each in found} == {"main", "variation"} if kept else {"main"}
+        assert sorted(score_table(found)["score"].unique()) == ([0.0, 1.0] if kept else [1.0])

@@ -21,8 +21,9 @@ from benchmark.reporting.light import light_section
 from benchmark.reporting.literature import published
 from benchmark.reporting.overview import overview
 from benchmark.reporting.page import claims_section, introduction, page, pooled_section
-from benchmark.reporting.scores import Study, axis_in_words, experiment_number, longest, read_study, score_table
+from benchmark.reporting.scores import Study, axis_in_words, experiment_number, read_study, score_table
 from benchmark.reporting.sections import Picture, study_sections
+from benchmark.reporting.side_runs import without_side_runs
 from sb3_cgp.common.files import write_atomically
 
 RUNTIME = Path(__file__).parent.parent / "results/runtime/runtime.json"
@@ -72,7 +73,7 @@ def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPE
     if len(set(names)) < len(names):
         raise ValueError(f"Two of these studies have the same name: {', '.join(names)}")
     print(f"Drawing the figures of {', '.join(names)} into {out / FIGURES}", file=sys.stderr, flush=True)
-    in_earnest = longest(studies)
+    in_earnest = without_side_runs(studies)
     together = stability_together(in_earnest, repetitions)
     pictures = [draw(study, repetitions) for study in studies]
     for picture in [*together, *itertools.chain(*pictures)]:

@@ -6,8 +6,9 @@ from benchmark.common.records import FINAL_EPISODES
 from benchmark.common.tables import markdown_table
 from benchmark.reporting.claims import RULES
 from benchmark.reporting.comparisons import DIFFERENCES_RULE
-from benchmark.reporting.scores import FAILURE_RULE, LENGTH_RULE, Study
+from benchmark.reporting.scores import FAILURE_RULE, Study
 from benchmark.reporting.sections import Picture, fold
+from benchmark.reporting.side_runs import SIDE_RUNS_RULE
 from benchmark.reporting.verdicts import Finding
 
 TITLE = "# Results of sweeps"
@@ -30,7 +31,7 @@ Numbers that seem to contradict each other:
 
 The intervals do not contain the variance of the mean over other episodes, so small differences may be due to these episodes.
 The figures and tables of a study use its own runs; the figure of all sweeps together{{claims}} the runs of all studies
-here. {LENGTH_RULE}{{papers}}
+here. {SIDE_RUNS_RULE}{{papers}}
 
 Intervals are 95 % percentile bootstrap intervals by rliable; runs are drawn within each task and configuration. Few runs make
 them too narrow: on normally distributed rewards, the interval of an interquartile mean of 2, 3, 4, 5, 10 runs contains the

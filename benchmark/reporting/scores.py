@@ -4,7 +4,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ import pandas as pd
 
 from benchmark.common.records import STUDY, Record, read_records
 
-LENGTH_RULE = "Shorter runs of an experiment on a task are left out of them where longer ones have all of their methods."
 FAILURE_RULE = (
     "A run that failed counts with the lowest return that any evaluation of any run on its task reached, and its learning "
     "curve continues at that return from its failure on."
@@ -107,30 +106,6 @@ def read_study(folder: Path) -> Study:
         return Study(folder.resolve().name, folder, json.loads((folder / STUDY).read_text()), read_records(folder))
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{folder} is no folder of a study: {Path(error.filename).name} is missing") from error
-
-
-def longest(studies: Sequence[Study]) -> list[Study]:
-    """
-    Return the studies without shorter trial runs, which must not weigh as much as the longest ones.
-
-    :param studies: the studies
-    :return: the studies without such runs, as :data:`LENGTH_RULE` defines them; those that have no others are left out
-    """
-    methods: dict[tuple[str, str], dict[int, set[str]]] = {}
-    for record in (record for study in studies for record in study.records):
-        by_steps = methods.setdefault((record.experiment, record.task), {})
-        by_steps.setdefault(record.steps, set()).add(record.method)
-
-    def is_trial(record: Record) -> bool:
-        by_steps = methods[record.experiment, record.task]
-        return any(steps > record.steps and by_steps[record.steps] <= longer for steps, longer in by_steps.items())
-
-    kept = []
-    for study in studies:
-        records = [record for record in study.records if not is_trial(record)]
-        if records:
-            kept.append(replace(study, records=records))
-    return kept
 
 
 def settings_in_words(settings: dict[str, Any]) -> str:

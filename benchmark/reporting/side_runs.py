@@ -1,0 +1,52 @@
+"""Runs that are shown by themselves, but do not count where studies are taken together: short trials and variations."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from benchmark.common.records import Record
+from benchmark.reporting.scores import Study
+
+SIDE_RUNS_RULE = (
+    "Shorter runs of an experiment on a task are left out of them where longer ones have all of their methods. So are runs of "
+    "a study with other hyperparameters, where another study has runs of the same length of all their methods and further ones."
+)
+
+
+def without_side_runs(studies: Sequence[Study]) -> list[Study]:
+    """
+    Return the studies without short trials and variations, which must not weigh as much as an experiment's main runs.
+
+    :param studies: the studies
+    :return: the studies without such runs, as :data:`SIDE_RUNS_RULE` defines them; those that have no others are left out
+    """
+    by_steps: dict[tuple[str, str], dict[int, set[str]]] = {}
+    by_study: dict[tuple[str, str, int], dict[str, set[str]]] = {}
+    for study in studies:
+        for record in study.records:
+            of_steps = by_steps.setdefault((record.experiment, record.task), {})
+            of_steps.setdefault(record.steps, set()).add(record.method)
+            of_study = by_study.setdefault((record.experiment, record.task, record.steps), {})
+            of_study.setdefault(study.name, set()).add(record.method)
+    configurations = {study.name: study.facts.get("configurations", {}) for study in studies}
+
+    def is_trial(record: Record) -> bool:
+        methods = by_steps[record.experiment, record.task]
+        return any(steps > record.steps and methods[record.steps] <= longer for steps, longer in methods.items())
+
+    def is_variation(record: Record, name: str) -> bool:
+        methods = by_study[record.experiment, record.task, record.steps]
+        mains = [other for other, more in methods.items() if methods[name] < more]
+        return any(_differ(configurations[name], configurations[main]) for main in mains)
+
+    kept = []
+    for study in studies:
+        records = [record for record in study.records if not is_trial(record) and not is_variation(record, study.name)]
+        if records:
+            kept.append(replace(study, records=records))
+    return kept
+
+
+def _differ(some: dict[str, Any], others: dict[str, Any]) -> bool:
+    """Return whether two studies have a configuration of the same name with different hyperparameters."""
+    return any(some[name] != others[name] for name in some.keys() & others.keys())
