@@ -9,7 +9,7 @@ from benchmark.reporting.scores import Study
 
 SIDE_RUNS_RULE = (
     "Shorter runs of an experiment on a task are left out of them where longer ones have all of their methods. So are runs of "
-    "a study with other hyperparameters, where another study has runs of the same length of all their methods and further ones."
+    "a study with other hyperparameters, where another study has runs of the same length of all their methods and of others."
 )
 
 
