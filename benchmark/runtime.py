@@ -41,7 +41,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--cem-dtype",
         choices=["auto", "float32", "bfloat16"],
-        help="data type of CEM's hidden layers in CEM-2, CEM-4, CGP-2, CGP-4 and CGP-Light (default: CGP's own)",
+        help="data type of CEM's hidden layers in CEM-2, CEM-4, CGP-2, CGP-4 and both CGP-Light (default: CGP's own)",
     )
     return parser.parse_args(argv)
 
