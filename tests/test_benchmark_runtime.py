@@ -121,8 +121,9 @@ def test_every_contender_has_the_same_batch_and_network():
             assert widths[:-1] == [256, 256], name
         assert (model.batch_size, model.gradient_steps, model.train_freq.frequency) == (128, 1, 1), name
         if contender.algorithm == "CGP":
-            sizes = (1, 16, "actor") if name == "CGP-Light" else (int(name[4]), 64, "prior")
+            sizes = (1, 16, "actor") if name.startswith("CGP-Light") else (int(name[4]), 64, "prior")
             assert (model.cem_iterations, model.cem_samples, model.cem_start) == sizes, name
+            assert model.policy_delay == (2 if name == "CGP-Light-delayed" else 1), name
             assert model.policy.inference == ("cem" if name.startswith("CEM") else "actor"), name
 
 
