@@ -10,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from benchmark.common.settings import LIGHT_ARGUMENTS
 from sb3_cgp.core.policies import CGPPolicy as PlainPolicy
 
 BATCH_SIZE = 128
@@ -61,8 +62,6 @@ class Contender:
     policy: str | type = "MlpPolicy"
 
 
-LIGHT = dict(cem_start="actor", cem_iterations=1, cem_samples=16)
-
 CONTENDERS = {
     "Random": Contender(None, paper_inference=0.20),
     "DDPG": Contender("stable_baselines3", "DDPG", 1.01, 0.99),
@@ -72,9 +71,9 @@ CONTENDERS = {
     "CEM-4": Contender("sb3_cgp", "CGP", 1.64, 4.30, dict(policy_loss=None, cem_iterations=4)),
     "CGP-2": Contender("sb3_cgp", "CGP", 1.95, 1.0, dict(cem_iterations=2)),
     "CGP-4": Contender("sb3_cgp", "CGP", 2.55, 1.0, dict(cem_iterations=4)),
-    "CGP-Light": Contender("sb3_cgp", "CGP", kwargs=LIGHT),
+    "CGP-Light": Contender("sb3_cgp", "CGP", kwargs=LIGHT_ARGUMENTS),
     # The actor is updated as seldom as TD3's
-    "CGP-Light-delayed": Contender("sb3_cgp", "CGP", kwargs=LIGHT | dict(policy_delay=2)),
+    "CGP-Light-delayed": Contender("sb3_cgp", "CGP", kwargs=LIGHT_ARGUMENTS | dict(policy_delay=2)),
     "CGP-2-plain": Contender("sb3_cgp", "CGP", kwargs=dict(cem_iterations=2), policy=PlainPolicy),
     "TQC": Contender("sb3_contrib", "TQC"),
     "CrossQ": Contender("sb3_contrib", "CrossQ"),

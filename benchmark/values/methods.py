@@ -10,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3 import TD3
 from stable_baselines3.common.noise import NormalActionNoise
 
+from benchmark.common.settings import LIGHT_ARGUMENTS
 from benchmark.values.variants import ClampedCGP, FlooredCGP, MinScorePolicy
 from sb3_cgp import CGP, CGPPolicy
 
@@ -35,7 +36,7 @@ class Method:
 
 MAIN = {
     **{f"CGP-{iterations}": Method(kwargs=dict(cem_iterations=iterations)) for iterations in (1, 2, 4, 8)},
-    "CGP-Light": Method(kwargs=dict(cem_start="actor", cem_iterations=1, cem_samples=16)),
+    "CGP-Light": Method(kwargs=LIGHT_ARGUMENTS),
     "TD3": Method(TD3),
 }
 # CGP-2 with one change each. A CUDA graph would fix the range of ClampedCGP.
