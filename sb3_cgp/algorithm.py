@@ -313,6 +313,24 @@ class CGP(
             custom_objects = {"actor_learning_rate": None} | custom_objects
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
+    def set_parameters(
+        self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """
+        Load parameters from a zip-file or a nested dictionary, as SB3 does.
+
+        In a model that has not learnt yet, ``predict`` uses the actor from then on if its optimizer's state shows that it has
+        been trained. An optimizer without state, such as SGD without momentum, cannot show it: use :meth:`load`.
+
+        :param load_path_or_dict: path to the file (or a file-like), or the parameters by module, see ``get_parameters``
+        :param exact_match: whether the parameters of every module must be given
+        :param device: Device on which the code should run.
+        :raises ValueError: if a module is missing or unknown
+        """
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        if self._n_updates == 0 and self.actor.optimizer.state:
+            self._note_trained_policy()
+
     def export(self, folder: str | pathlib.Path) -> None:
         """
         Write the policy that ``predict`` uses, to be used elsewhere and loaded without pickle.

@@ -122,6 +122,64 @@ class TestOffline:
         make_model().save(tmp_path / "untrained")
         assert CGP.load(tmp_path / "untrained", policy_training="offline").policy.inference == "cem"
 
+    @pytest.mark.parametrize("saved", [dict(policy_loss=None), dict(policy_training="offline")], ids=["no actor", "offline"])
+    @pytest.mark.parametrize("further", [dict(), dict(cem_start="actor"), dict(policy_delay=7)], ids=str)
+    def test_an_actor_that_lags_behind_its_critics_acts_when_it_has_been_trained(self, saved, further, tmp_path):
+        model = make_model(**saved)
+        OffPolicyAlgorithm.learn(model, 100)
+        model.save(tmp_path / "model")
+        online = dict(policy_loss="cgp", policy_training="online")
+        loaded = CGP.load(tmp_path / "model", env=gym.make("Pendulum-v1"), **online, **further)
+        assert (loaded.policy.inference, loaded.policy.actor_proposes) == ("cem", False)
+        with pytest.raises(ValueError, match="there is no trained actor"):
+            loaded.export(tmp_path / "exported")
+        watcher = self.Watcher()
+        loaded.learn(70, callback=watcher)
+        # The callback sees a step before its gradient step; 50 steps are random
+        gradient_steps = next(n for n in range(1, 100) if (50 + n) % loaded.policy_delay == 0)
+        assert watcher.inferences == ["cem"] * (50 + gradient_steps) + ["actor"] * (20 - gradient_steps)
+        assert loaded.policy.actor_proposes
+
+    @pytest.mark.parametrize("delay", [1, 30])
+    def test_a_new_online_policy_acts_from_the_start(self, delay, tmp_path):
+        watcher = self.Watcher()
+        model = make_model(policy_delay=delay, cem_start="actor").learn(60, callback=watcher)
+        assert set(watcher.inferences) == {"actor"}
+        model.save(tmp_path / "model")
+        loaded = CGP.load(tmp_path / "model")
+        assert (loaded.policy.inference, loaded.policy.actor_proposes) == ("actor", True)
+
+    def test_the_first_training_of_an_actor_leaves_the_users_choice_alone(self):
+        model = make_model()
+        with model.policy.acting_by("averaged_actor"):
+            assert model.learn(60).policy.inference == "averaged_actor"
+
+    def test_a_policy_that_a_callback_stops_too_early_does_not_act_in_a_loaded_model_either(self, tmp_path):
+        model = make_model(policy_loss=None).learn(100)
+        model.save(tmp_path / "model")
+        model.save_replay_buffer(tmp_path / "buffer")
+        loaded = CGP.load(tmp_path / "model", policy_loss="cgp")
+        loaded.load_replay_buffer(tmp_path / "buffer")
+        with pytest.warns(UserWarning, match="A callback stopped the policy's training after 3 steps: CEM acts"):
+            loaded.train_policy(callback=self.Watcher(stop_after=3))
+        assert loaded.policy.inference == "cem"
+        assert loaded.train_policy().policy.inference == "actor"
+
+    @pytest.mark.parametrize("way", ["file", "dictionary"])
+    def test_a_trained_actor_acts_where_its_parameters_are_set(self, way, tmp_path):
+        def given(model):
+            model.save(tmp_path / "model.zip")
+            return str(tmp_path / "model.zip") if way == "file" else model.get_parameters()
+
+        new = make_model(policy_training="offline", seed=1)
+        new.set_parameters(given(make_model(policy_training="offline")))
+        assert new.policy.inference == "cem"
+        trained = make_model(policy_training="offline").learn(100)
+        new.set_parameters(given(trained))
+        assert new.policy.inference == "actor"
+        observation = new.observation_space.sample()
+        assert new.predict(observation)[0] == trained.predict(observation)[0]
+
     @pytest.mark.parametrize("policy_loss", ["cgp", "qgp"])
     def test_critics_with_batch_norm_stay_as_they_are(self, policy_loss):
         class Normalizing(BaseFeaturesExtractor):

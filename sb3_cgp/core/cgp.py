@@ -150,7 +150,14 @@ class CGP(OffPolicyAlgorithm):
 
     @property
     def _has_actor(self) -> bool:
-        return self._trains_online or (self.policy_loss is not None and self._policy_is_trained)
+        # From the start where the actor learns with the critics, but not where these have learnt without it
+        learns_along = self._trains_online and self._n_updates <= self.policy_delay
+        return self.policy_loss is not None and (self._policy_is_trained or learns_along)
+
+    def _note_trained_policy(self) -> None:
+        had_actor, self._policy_is_trained = self._has_actor, True
+        if not had_actor:
+            self._choose_inference()
 
     @property
     def _trains_online(self) -> bool:
@@ -207,7 +214,7 @@ class CGP(OffPolicyAlgorithm):
                 assert self.policy_loss is not None
                 actor_loss = POLICY_LOSSES[self.policy_loss](self.policy, batch.observations)
                 self._descend("actor", actor_loss)
-                self._policy_is_trained = True
+                self._note_trained_policy()
                 values["actor_loss"].append(actor_loss.detach())
 
             # Update the target critics and the averaged actor, every second step by default (Appendix B)

@@ -131,8 +131,9 @@ class CudaGraphAlgorithm(CGP):
                     losses[name].append(loss)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._unlogged.update(losses)
-        # The core's `train` sets these two, which no replay does
-        self._policy_is_trained |= "actor_loss" in losses
+        # The core's `train` notes these two, which no replay does
+        if "actor_loss" in losses:
+            self._note_trained_policy()
         self._policy_is_due = self.policy_training == "offline"
         if self._n_updates // CHECK_INTERVAL > n_updates_before // CHECK_INTERVAL:
             self._loss_watch.check()

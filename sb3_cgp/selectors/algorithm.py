@@ -15,8 +15,8 @@ class SelectorAlgorithm(CGP):
     """
     CGP whose CEM starts from the prior, as in the paper, or from the actor.
 
-    Acting and the policy's loss start from the actor, bootstrap actions from the averaged actor. Until an offline training has
-    trained the actor, all samples are the prior's.
+    Acting and the policy's loss start from the actor, bootstrap actions from the averaged actor. All samples are the prior's
+    while the critics have learnt and the actor has not, as in offline training.
     """
 
     # The arguments of the constructor
