@@ -16,9 +16,11 @@ from benchmark.common.style import METHODS
 from benchmark.reporting import figures as command
 from benchmark.reporting import learning_curves
 from benchmark.reporting.figures import draw, figures, minutes_caption
+from benchmark.reporting.interactive import figure
 from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, timed_runs
 from benchmark.reporting.literature import literature_section, published
 from benchmark.reporting.scores import Study, read_study
+from benchmark.reporting.summary import summary
 
 E10 = ["CGP-Online", "CGP-Light", "QGP-Online", "TD3", "SAC", "CGP-Online by CEM"]
 FORBIDDEN = ["ForbiddenPendulum-v1", "ForbiddenHopper-v1"]
@@ -241,3 +243,38 @@ def test_page_of_e10(tmp_path: Path) -> None:
         "final_rewards.png",
         *(f"learning_curves{kind}_{task}.png" for kind in ("", "_by_minutes") for task in FORBIDDEN),
     }
+
+
+CRASHED = [record("TD3", seed, None, returns=[]) for seed in range(2)]
+EARLY = [record("TD3", seed, 10.0, returns=[10.0]) for seed in range(2)]
+SWEPT = runs(lambda *_: 1.0, ["TD3", "SAC"], [{"width": 32}, {"width": 64}])
+
+
+@pytest.mark.parametrize(
+    ("records", "kinds"),
+    [
+        ([timed("Random", 0, 1.0), *CRASHED], ["learning_curves", "final_rewards"]),
+        ([timed("Random", 0, 1.0), timed("TD3", 0, None)], ["learning_curves", "final_rewards"]),
+        (CRASHED, ["learning_curves", "final_rewards"]),
+        ([*CRASHED, timed("SAC", 0, 1.0)], ["learning_curves", "learning_curves_by_minutes", "final_rewards"]),
+        (EARLY, ["learning_curves", "final_rewards"]),
+    ],
+    ids=["only random actions were timed", "no learner was timed", "all crashed", "one method crashed", "none has learnt"],
+)
+def test_a_study_whose_learners_ended_early_is_drawn(records: list[Record], kinds: list[str], tmp_path: Path) -> None:
+    records = [replace(run, processor_seconds=None) if run in EARLY else run for run in records]
+    chosen = study(tmp_path, records, configurations={"TD3": {"learning_starts": 500}})
+    assert [Path(picture.path).stem.removesuffix("_Pendulum-v1") for picture in draw(chosen, 20)] == kinds
+    shown = {trace["legendgroup"] for trace in figure(chosen, "Pendulum-v1", 20)["data"]}
+    assert shown == {run.method for run in records} - {"Random"}
+    swept = read_study(write_study(tmp_path / "swept", SWEPT))
+    if any(run.returns for run in records if run.method != "Random"):
+        assert summary(chosen, swept, 20).startswith(b"\x89PNG")
+    else:
+        with pytest.raises(ValueError, match="sweep has no evaluation of CGP-Online, CGP-Light, TD3, SAC"):
+            summary(chosen, swept, 20)
+
+
+def test_random_actions_are_not_counted_among_the_runs_without_a_time(tmp_path: Path) -> None:
+    chosen = study(tmp_path, [timed("TD3", 0, 8.0), timed("Random", 0, None)])
+    assert "Left out" not in minutes_caption(chosen, "Pendulum-v1")

@@ -81,7 +81,7 @@ def bootstrap(
     finally:
         np.random.set_state(state)  # noqa: NPY002
     drawn = [
-        np.stack(each).reshape(repetitions, -1, *array.shape[2:])
+        np.stack(each).reshape(repetitions, array.shape[0] * array.shape[1], *array.shape[2:])
         for each, array in zip(zip(*draws, strict=True), arrays, strict=True)
     ]
     pooled = (

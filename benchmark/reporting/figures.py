@@ -16,7 +16,7 @@ from benchmark.reporting.commands import FIGURES_ONLY, FOLDER, command_line, wit
 from benchmark.reporting.comparisons import experiments_section
 from benchmark.reporting.drawing import final_rewards, sensitivity, stability, values
 from benchmark.reporting.estimates import REPETITIONS
-from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, timed_runs
+from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, shown_methods, timed_runs
 from benchmark.reporting.light import light_section
 from benchmark.reporting.literature import published
 from benchmark.reporting.overview import overview
@@ -199,7 +199,9 @@ def minutes_caption(study: Study, task: str) -> str:
     :param task: the task
     :return: the caption, with the number of runs that are left out, and a warning if the runs were on several machines
     """
-    left_out = sum(record.task == task for record in study.records) - len(timed_runs(study, task)[0])
+    shown = shown_methods(study, task)
+    ran = sum(record.task == task and record.method in shown for record in study.records)
+    left_out = ran - len(timed_runs(study, task)[0])
     machines = [command["machine"] for command in study.facts["commands"]]
     processors = dict.fromkeys(str(machine["gpu"] or machine["cpu"]) for machine in machines)
     sentences = [MINUTES.format(task)]

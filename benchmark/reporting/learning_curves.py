@@ -73,9 +73,11 @@ def timed_runs(study: Study, task: str) -> tuple[list[Record], dict[str, float]]
 
     :param study: the study
     :param task: the task
-    :return: the runs, and the minutes per step by method; without methods of which no complete run has a time
+    :return: the runs, and the minutes per step by method; of :func:`shown_methods`, without those of which no complete run has
+        a time
     """
-    measured = [record for record in study.records if record.task == task and record.processor_seconds is not None]
+    records = [record for record in study.records if record.task == task and record.method in shown_methods(study, task)]
+    measured = [record for record in records if record.processor_seconds is not None]
     minutes: dict[str, list[float]] = {}
     for record in measured:
         if record.processor_seconds is not None and not failed(record):

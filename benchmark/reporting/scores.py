@@ -226,7 +226,7 @@ def curves(records: Sequence[Record], floor: float, grid: np.ndarray) -> np.ndar
     :param grid: environment steps (E)
     :return: returns (N, E), interpolated linearly between evaluations
     """
-    lines = np.full((len(records), len(grid)), floor)
+    lines = np.full((len(records), len(grid)), float(floor))
     for line, record in zip(lines, records, strict=True):
         timesteps, returns = np.array(record.timesteps, dtype=float), np.array(record.returns, dtype=float)
         known = np.isfinite(returns)

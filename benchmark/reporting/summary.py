@@ -26,7 +26,7 @@ def summary(learning: Study, sweep: Study, repetitions: int = REPETITIONS) -> by
     :param sweep: a study with axes
     :param repetitions: number of bootstrap samples
     :return: the picture, as PNG
-    :raises ValueError: if a study is not of its kind, or has none of the methods
+    :raises ValueError: if a study is not of its kind, or has no evaluation of the methods
     """
     if learning.axes or not sweep.axes:
         raise ValueError(f"{learning.name} must be a study of learning curves, and {sweep.name} one of hyperparameters")
@@ -44,12 +44,12 @@ def methods_of(study: Study, task: str) -> Sequence[str]:
     :param study: the study
     :param task: its task
     :return: the methods
-    :raises ValueError: if no run of any has ended
+    :raises ValueError: if no run of any has been evaluated
     """
-    ran = {record.method for record in study.records if record.task == task}
-    methods = [method for method in METHODS if method in ran]
-    if not methods:
-        raise ValueError(f"{study.name} has no run of {', '.join(METHODS)}")
+    runs = [record for record in study.records if record.task == task and record.method in METHODS]
+    methods = [method for method in METHODS if any(run.method == method for run in runs)]
+    if not any(run.returns for run in runs):
+        raise ValueError(f"{study.name} has no evaluation of {', '.join(METHODS)}")
     return methods
 
 
@@ -66,9 +66,10 @@ def _draw_learning(panel: Axes, study: Study, repetitions: int) -> None:
         draw_line(panel, grid, middle, method if len(runs) >= planned else f"{method}, {len(runs)} of {planned} seeds", look)
         if interval is not None:
             panel.fill_between(grid, *interval, color=look["color"], **BAND)
-        trained.append(lines[:, grid > first_training_step(study)].ravel())
+        trained.append(lines[:, grid > first_training_step(study)])
     panel.set(title=task, xlabel="environment steps", ylabel="return", xlim=(0, grid[-1]))
-    panel.set_ylim(learnt_range(np.concatenate(trained)))
+    if any(line.size for line in trained):
+        panel.set_ylim(learnt_range(np.concatenate([line.ravel() for line in trained])))
     panel.xaxis.set_major_formatter(EngFormatter(sep=""))
     panel.yaxis.set_major_formatter(EngFormatter(sep=""))
 
