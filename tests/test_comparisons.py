@@ -22,6 +22,7 @@ from benchmark.reporting.comparisons import (
     differences_table,
     experiments_section,
     pairs_of,
+    pooled_rows,
 )
 from benchmark.reporting.estimates import Estimate, welch
 from benchmark.reporting.light import light_section
@@ -153,6 +154,32 @@ def test_tasks_in_studies_of_their_own_are_compared_together(tmp_path: Path) -> 
     assert experiments_section([first], 500) == experiments_section([alone], 500) == ""
 
 
+def test_all_tasks_are_those_on_which_both_were_compared(tmp_path: Path) -> None:
+    """A task that one study ran with the first method, and another study with the second, is none of them."""
+    pair, both = ["CGP-Online", "TD3"], ["Hopper-v5", "Ant-v5"]
+
+    def scored(methods: list[str], tasks: list[str]) -> list[Record]:
+        return runs(lambda method, _, seed: float(seed + 3 * (method == "TD3")), methods, tasks=tasks)
+
+    one = study(tmp_path, [*scored(pair, both), *scored(["CGP-Online"], ["Pusher-v5"])], "one")
+    other = study(tmp_path, scored(["TD3"], ["Pusher-v5"]), "other")
+    ((name, _, *found),) = pooled_rows(score_table([one, other]), pair, 200)
+    assert (name, found[-1]) == ("all tasks (2)", "8 and 8")
+    ((_, _, *expected),) = pooled_rows(score_table([study(tmp_path, scored(pair, both), "both")]), pair, 200)
+    assert found == expected
+
+
+def test_experiments_of_users_are_not_taken_together_by_their_names_beginning(tmp_path: Path) -> None:
+    studies = []
+    for name, task in (("my-walker", "Walker2d-v5"), ("my-arm", "Reacher-v5")):
+        records = runs(lambda method, _, seed: float(seed + 3 * (method == "TD3")), ["CGP-Online", "TD3"], tasks=[task])
+        studies.append(study(tmp_path, [replace(run, experiment=name) for run in records], name))
+    assert experiments_section(studies, 200) == ""
+    for each in studies:
+        each.facts["experiment"] = "my-robots"
+    assert "my-robots, the studies my-walker, my-arm:" in experiments_section(studies, 200)
+
+
 def test_one_task_is_not_all_tasks(tmp_path: Path) -> None:
     chosen = study(tmp_path, runs(lambda method, _, seed: float(seed), ["CGP-Light", "TD3"]))
     assert list(rows(differences_table(score_table([chosen]), chosen.methods))) == [("Pendulum-v1", "CGP-Light − TD3")]
@@ -171,7 +198,10 @@ def compared(folder: Path, light: dict[str, float], seeds: int = 4) -> str:
 def test_losses_are_named_with_their_tasks(tmp_path: Path) -> None:
     text = compared(tmp_path, {"Hopper-v5": 20.0, "Ant-v5": 80.0, "Pusher-v5": 50.0})
     half = 2.4469 * math.sqrt(2 * 5 / 3 / 4)
-    assert f"**Yes, on Hopper-v5 (sweep, 1,000 steps) by 30.00 ({30 - half:.2f} to {30 + half:.2f}).**" in text
+    assert (
+        f"**Yes, on Hopper-v5 (sweep, 1,000 steps) by 30.00 ({30 - half:.2f} to {30 + half:.2f}), 30% of the task's range.**"
+        in text
+    )
     assert "CGP-Light is higher on Ant-v5 (sweep, 1,000 steps)." in text
     assert "not distinguishable on Pusher-v5 (sweep, 1,000 steps), which is no proof" in text
     assert f"losses of up to {half:.0f}% of a task's range, on Pusher-v5" in text
@@ -186,12 +216,48 @@ def test_no_loss_and_nothing_known(tmp_path: Path) -> None:
     assert "Too few seeds have ended on Hopper-v5" in text
 
 
+def with_failures(folder: Path, crashed: dict[str, int], returns: list[float]) -> str:
+    """Write a study whose runs score 50 in a range from 0, but for those that failed after these returns."""
+    records = [record("TD3", 0, 1.0, returns=[0.0])]
+    for method, failures in crashed.items():
+        records += [record(method, seed, None, returns=returns) for seed in range(failures)]
+        records += [record(method, seed, 50.0 + seed) for seed in range(failures, 5)]
+    return unpadded(light_section([study(folder, records)]))
+
+
+def test_failed_runs_are_counted_beside_the_answer(tmp_path: Path) -> None:
+    text = with_failures(tmp_path / "some", {"CGP-Light": 2, "CGP-Online": 0}, [10.0])
+    assert "**Runs failed:** 2 of CGP-Light and 0 of CGP-Online on Pendulum-v1 (sweep, 1,000 steps); they count with" in text
+    # The interval of three runs at 50 and two at 0 reaches below the task's range, whose best is that of Online's last run
+    assert "| not distinguishable | 100% | 5 |" in text
+    assert "failed" not in with_failures(tmp_path / "none", {"CGP-Light": 0, "CGP-Online": 0}, [])
+
+
+def test_nothing_is_concluded_where_all_runs_failed(tmp_path: Path) -> None:
+    failing = runs(lambda *_: None, ["CGP-Light", "CGP-Online"])
+    text = light_section([study(tmp_path, failing)])
+    assert "**Not known yet" in text
+    assert "No runs of both have ended, or all have failed, on Pendulum-v1 (sweep, 1,000 steps)." in text
+    half = [*failing[:4], *runs(lambda *run: 50.0 + run[2], ["CGP-Online"])]
+    assert "**Yes, on Pendulum-v1" in light_section([study(tmp_path, half)])
+
+
+@pytest.mark.parametrize(("loss", "percent"), [(0.04, "below 0.1%"), (0.5, "0.5%"), (5.0, "5%")])
+def test_a_small_loss_is_given_as_a_share_of_the_range(loss: float, percent: str, tmp_path: Path) -> None:
+    records = [record("TD3", 0, 100.0, returns=[0.0])]
+    records += [record("CGP-Online", seed, 50.0) for seed in range(4)]
+    records += [record("CGP-Light", seed, 50.0 - loss) for seed in range(4)]
+    text = unpadded(light_section([study(tmp_path, records)]))
+    assert f"), {percent} of the task's range.**" in text
+    assert f"| lower | {percent} | 4 |" in text
+
+
 def test_tasks_that_one_of_them_lacks_and_studies_that_do_not_compare_them(tmp_path: Path) -> None:
     both = runs(lambda *_: 1.0, ["CGP-Light", "CGP-Online"], tasks=["Hopper-v5"])
     unfinished = study(tmp_path, [*both, *runs(lambda *_: 1.0, ["CGP-Light"], tasks=["Ant-v5"])], "unfinished")
     text = light_section([unfinished])
     assert "**No loss is shown on 1 of 2 tasks" in text
-    assert "No runs of both have ended on Ant-v5 (unfinished, 1,000 steps)." in text
+    assert "No runs of both have ended, or all have failed, on Ant-v5 (unfinished, 1,000 steps)." in text
     swept = runs(lambda *_: 1.0, ["CGP-Light", "CGP-Online"], [{"width": 32}, {"width": 64}])
     assert light_section([study(tmp_path, swept, "swept")]) == ""
     assert light_section([study(tmp_path, runs(lambda *_: 1.0, ["CGP-Light", "TD3"]), "without")]) == ""

@@ -11,11 +11,12 @@ from benchmark.reporting.estimates import (
     REPETITIONS,
     Estimate,
     compare,
+    in_common,
     number_format,
     probability_of_improvement,
     welch,
 )
-from benchmark.reporting.scores import Study, score_table
+from benchmark.reporting.scores import Study, experiment_number, score_table
 from benchmark.reporting.verdicts import LIGHT, OURS
 
 RANDOM = "Random"
@@ -24,10 +25,12 @@ HIGHER, LOWER, NOT_DISTINGUISHABLE, TOO_FEW = "higher", "lower", "not distinguis
 DIFFERENCES_RULE = f"""\
 In tables of differences, each row has the first method's mean final reward less the second's. The intervals of single tasks
 are Welch's t intervals: with 4 runs each, these contain the true difference in 96 % of the cases on normally distributed
-rewards (in 94 % where one standard deviation is three times the other, in 98 % where a quarter of the runs collapses), but a
-percentile bootstrap in 84 % only. The rows on all tasks have means over the tasks with {FEWEST_RUNS} or more runs of both
-methods, of rewards as shares of each task's range, from 0 for the lowest return of any evaluation to 1 for the best final
-reward, with stratified bootstrap intervals (90 % of the cases with 4 runs on each of 5 tasks).
+rewards, and in 95 % where one standard deviation is three times the other; a percentile bootstrap does in 84 %. Where a
+quarter of the runs collapses by 10 standard deviations, they contain it in 98 % of the cases if runs of both methods do, but
+in 74 % if those of one method alone do, of whose 4 runs none collapses in a third of the cases. The rows on all tasks have
+means over the tasks with {FEWEST_RUNS} or more runs of both methods, of rewards as shares of each task's range, from 0 for
+the lowest return of any evaluation to 1 for the best final reward, with stratified bootstrap intervals (90 % of the cases
+with 4 runs on each of 5 tasks).
 *{NOT_DISTINGUISHABLE.capitalize()}* means that the interval contains 0, which is no proof that the methods are equal; with
 fewer than {FEWEST_RUNS} runs of a method, nothing is concluded. One in twenty intervals misses the true difference by chance,
 and no correction is made for their number."""
@@ -116,9 +119,10 @@ def pooled_rows(table: pd.DataFrame, methods: Sequence[str], repetitions: int = 
     """
     tasks, rows = list(dict.fromkeys(table["task"])), []
     for pair in pairs_of(methods):
-        singles = {task: task_difference(table, task, pair) for task in tasks}
+        common = in_common(table, pair)
+        singles = {task: task_difference(common, task, pair) for task in tasks}
         enough = [task for task, found in singles.items() if found is not None and found.runs >= FEWEST_RUNS]
-        runs = table[table["task"].isin(enough)]
+        runs = common[common["task"].isin(enough)]
         pooled = compare(runs, pair, mean_difference, repetitions=repetitions)
         if len(enough) > 1 and pooled is not None:
             rows.append(_row(f"all tasks ({len(enough)})", pair, pooled, ".3f", runs))
@@ -136,15 +140,16 @@ def experiments_section(studies: Sequence[Study], repetitions: int = REPETITIONS
     families: dict[str, list[Study]] = {}
     for study in studies:
         if not study.axes:
-            # The files of one experiment are named after it: e10-quick, e10-locomotion
-            families.setdefault(study.facts["experiment"].split("-")[0], []).append(study)
+            # The files of one of this project's experiments are named after it: e10-quick, e10-locomotion
+            number = experiment_number(study)
+            families.setdefault(study.facts["experiment"] if number is None else f"E{number}", []).append(study)
     parts = []
     for family, members in families.items():
         methods = list(dict.fromkeys(method for study in members for method in study.methods))
         rows = pooled_rows(score_table(members), methods, repetitions) if len(members) > 1 else []
         if rows:
             names = ", ".join(study.name for study in members)
-            parts += [f"{family.upper()}, the studies {names}:", markdown_table(HEADER, rows)]
+            parts += [f"{family}, the studies {names}:", markdown_table(HEADER, rows)]
     return "\n\n".join(["## Differences on all tasks of an experiment", *parts]) if parts else ""
 
 

@@ -111,7 +111,7 @@ def page_of(
     command = command_line([] if folders == study_folders(out) else folders, out, repetitions)
     found = [
         overview(studies, repetitions),
-        light_section(studies),
+        light_section(in_earnest),
         experiments_section(in_earnest, repetitions),
     ]
     pooled = [pooled_section(picture, f"{command} {FIGURES_ONLY}") for picture in together]

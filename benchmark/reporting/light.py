@@ -1,4 +1,4 @@
-"""Whether the light setting of CEM loses anything against the paper's: the answer of all studies that ran both."""
+"""Whether the light setting of CEM loses anything against the paper's: the answer of studies of learning curves with both."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,12 +28,14 @@ class Comparison:
     :param reward: the difference of mean final rewards
     :param share: the same as a share of the task's range
     :param form: the format of rewards
+    :param failed: how many runs of each failed, which count with the task's lowest return
     """
 
     place: str
     reward: Estimate
     share: Estimate
     form: str
+    failed: tuple[int, int]
 
     @property
     def word(self) -> str:
@@ -43,7 +45,7 @@ class Comparison:
     @property
     def largest_loss(self) -> float | None:
         """The largest loss within the interval, as a share of the task's range; None without an interval."""
-        return None if self.share.interval is None else max(0.0, -self.share.interval[0])
+        return None if self.share.interval is None else min(max(0.0, -self.share.interval[0]), 1.0)
 
 
 def light_section(studies: Sequence[Study]) -> str:
@@ -61,12 +63,14 @@ def light_section(studies: Sequence[Study]) -> str:
         table = score_table([study])
         for task in dict.fromkeys([*study.facts["tasks"], *study.tasks]):
             place = f"{task} ({study.name}, {study.facts['steps']:,} steps)"
-            reward, share = (task_difference(table, task, PAIR, column) for column in ("score", "share"))
-            if reward is None or share is None:
+            runs = table[(table["task"] == task) & table["method"].isin(PAIR)]
+            reward, share = (task_difference(runs, task, PAIR, column) for column in ("score", "share"))
+            if reward is None or share is None or runs["failed"].all():
                 missing.append(place)
             else:
                 form = number_format(table[table["task"] == task]["score"])
-                compared.append(Comparison(place, reward, share, form))
+                light, ours = (int(runs[runs["method"] == method]["failed"].sum()) for method in PAIR)
+                compared.append(Comparison(place, reward, share, form, (light, ours)))
     rows = [
         [each.place, each.reward.in_words(each.form), each.word, _percent(each.largest_loss), str(each.reward.runs)]
         for each in compared
@@ -82,7 +86,7 @@ def answer(compared: Sequence[Comparison], missing: Sequence[str]) -> str:
     Answer in sentences.
 
     :param compared: the comparisons
-    :param missing: the tasks on which one of the two methods has no run yet
+    :param missing: the tasks on which one of the two methods has no run yet, or all runs of both failed
     :return: the answer, in Markdown
     """
 
@@ -91,14 +95,23 @@ def answer(compared: Sequence[Comparison], missing: Sequence[str]) -> str:
 
     total = len(compared) + len(missing)
     decided = [each for each in compared if each.word != TOO_FEW]
-    losses = [f"{each.place} by {each.reward.negative().in_words(each.form)}" for each in decided if each.word == LOWER]
+    losses = [
+        f"{each.place} by {each.reward.negative().in_words(each.form)}, {_percent(-each.share.value)} of the task's range"
+        for each in decided
+        if each.word == LOWER
+    ]
     if losses:
-        sentences = [f"**Yes, on {', '.join(losses)}.**"]
+        sentences = [f"**Yes, on {'; '.join(losses)}.**"]
     elif decided:
         counted = f"{len(decided)} of {total} tasks, those with {FEWEST_RUNS} or more seeds of both"
         sentences = [f"**No loss is shown on {counted}.**"]
     else:
         sentences = [f"**Not known yet: on no task have {FEWEST_RUNS} seeds of both methods ended.**"]
+    failures = [
+        f"{each.failed[0]} of {LIGHT} and {each.failed[1]} of {OURS} on {each.place}" for each in compared if any(each.failed)
+    ]
+    if failures:
+        sentences.append(f"**Runs failed:** {', '.join(failures)}; they count with the task's lowest return.")
     if places(HIGHER):
         sentences.append(f"{LIGHT} is higher on {places(HIGHER)}.")
     if places(NOT_DISTINGUISHABLE):
@@ -111,9 +124,11 @@ def answer(compared: Sequence[Comparison], missing: Sequence[str]) -> str:
     if places(TOO_FEW):
         sentences.append(f"Too few seeds have ended on {places(TOO_FEW)}.")
     if missing:
-        sentences.append(f"No runs of both have ended on {', '.join(missing)}.")
+        sentences.append(f"No runs of both have ended, or all have failed, on {', '.join(missing)}.")
     return " ".join(sentences)
 
 
 def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{share:.0%}"
+    if share is None:
+        return "-"
+    return "below 0.1%" if 0 < share < 0.001 else f"{share:.1%}" if 0 < share < 0.01 else f"{share:.0%}"

@@ -35,7 +35,7 @@ here. {SIDE_RUNS_RULE}{{papers}}
 
 Intervals are 95 % percentile bootstrap intervals by rliable; runs are drawn within each task and configuration. Few runs make
 them too narrow: on normally distributed rewards, the interval of an interquartile mean of 2, 3, 4, 5, 10 runs contains the
-true value in 52, 72, 88, 89, 93 % of the cases. There is no interval where a configuration has one run only.
+true value in 50, 75, 88, 90, 93 % of the cases. There is no interval where a configuration has one run only.
 
 {DIFFERENCES_RULE}"""
 
