@@ -329,7 +329,7 @@ class CGP(
         """
         super().set_parameters(load_path_or_dict, exact_match, device)
         if self._n_updates == 0 and self.actor.optimizer.state:
-            self._note_trained_policy()
+            self._mark_policy(is_trained=True)
 
     def export(self, folder: str | pathlib.Path) -> None:
         """

@@ -33,7 +33,7 @@ class CGP(OffPolicyAlgorithm):
     Learns Q-functions by TD3's objective, with actions picked by the Cross-Entropy Method (CEM), and distils CEM into
     an actor that acts at inference for the price of one forward pass.
 
-    Paper: https://arxiv.org/abs/1903.10605 (Algorithms 1 and 2; the defaults follow Appendices A and B)
+    Paper: https://arxiv.org/abs/1903.10605 (Algorithms 1 and 2; the defaults are Appendix B's)
     The arguments that are not listed are those of SB3's ``OffPolicyAlgorithm``.
 
     :param learning_rate: learning rate of the critics: a number, a function of the progress remaining (from 1 to 0), or a
@@ -51,8 +51,7 @@ class CGP(OffPolicyAlgorithm):
         the actor. Rollouts always use CEM, and so does ``predict`` where no actor is trained.
     :param actor_learning_rate: learning rate of the actor, in the same forms. None stands for ``learning_rate``.
     :param policy_delay: The actor is updated once every ``policy_delay`` gradient steps
-    :param target_update_interval: The target critics and the averaged actor are updated once every
-        ``target_update_interval`` gradient steps
+    :param target_update_interval: number of gradient steps between two updates of the target critics and the averaged actor
     :param target_policy_noise: Standard deviation of Gaussian noise added to target actions (smoothing noise)
     :param target_noise_clip: Limit for absolute value of target policy smoothing noise.
     :param kwargs: the further arguments of SB3's ``OffPolicyAlgorithm``. A ``selector`` in ``policy_kwargs`` replaces CEM.
@@ -117,7 +116,6 @@ class CGP(OffPolicyAlgorithm):
         self._policy_is_trained = False
         # Whether the critics have learnt since the last offline training of the policy
         self._policy_is_due = False
-
         if _init_setup_model:
             self._setup_model()
 
@@ -154,9 +152,9 @@ class CGP(OffPolicyAlgorithm):
         learns_along = self._trains_online and self._n_updates <= self.policy_delay
         return self.policy_loss is not None and (self._policy_is_trained or learns_along)
 
-    def _note_trained_policy(self) -> None:
-        had_actor, self._policy_is_trained = self._has_actor, True
-        if not had_actor:
+    def _mark_policy(self, is_trained: bool) -> None:
+        had_actor, self._policy_is_trained = self._has_actor, is_trained
+        if self._has_actor != had_actor:
             self._choose_inference()
 
     @property
@@ -178,14 +176,12 @@ class CGP(OffPolicyAlgorithm):
         :param batch_size: number of transitions in a minibatch, b
         """
         assert self.replay_buffer is not None
-        # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         self._update_learning_rates(self._current_progress_remaining, "critic", "actor")
 
         values = defaultdict(list)
         for _ in range(gradient_steps):
             self._n_updates += 1
-            # Sample a minibatch
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             # For n-step replay, discount factor is gamma**n_steps (when no early termination)
             discounts = batch.discounts if batch.discounts is not None else self.gamma
@@ -214,7 +210,7 @@ class CGP(OffPolicyAlgorithm):
                 assert self.policy_loss is not None
                 actor_loss = POLICY_LOSSES[self.policy_loss](self.policy, batch.observations)
                 self._descend("actor", actor_loss)
-                self._note_trained_policy()
+                self._mark_policy(is_trained=True)
                 values["actor_loss"].append(actor_loss.detach())
 
             # Update the target critics and the averaged actor, every second step by default (Appendix B)
@@ -290,8 +286,7 @@ class CGP(OffPolicyAlgorithm):
 
         plateau, losses, was_trained = offline.Plateau(), [], self._policy_is_trained
         # Callbacks evaluate and save the actor that is being trained
-        self._policy_is_trained = True
-        self._choose_inference()
+        self._mark_policy(is_trained=True)
         try:
             callback = self._init_callback(callback)
             callback = with_progress_bar(callback) if progress_bar else callback
@@ -327,16 +322,14 @@ class CGP(OffPolicyAlgorithm):
                 warnings.warn(f"A callback stopped the policy's training after {n_steps} steps: CEM acts.", stacklevel=2)
             self._policy_is_due = False
         finally:
-            self._policy_is_trained = was_trained
-            self._choose_inference()
+            self._mark_policy(was_trained)
         callback.on_training_end()
         if self.verbose >= 1:
             print(f"The policy was trained for {n_steps} gradient steps")
         return self
 
     def _excluded_save_params(self) -> list[str]:
-        aliases = ["actor", "actor_target", "critic", "critic_target"]
-        return [*super()._excluded_save_params(), *aliases, "_actor_lr_schedule"]
+        return [*super()._excluded_save_params(), "actor", "actor_target", "critic", "critic_target", "_actor_lr_schedule"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []

@@ -80,7 +80,7 @@ class CGPPolicy(TD3Policy):
         """
         Select the actions that the first network of a critic rates highest (π_CEM of Algorithm 1).
 
-        Each observation passes the features extractor once. The critic is in evaluation mode meanwhile.
+        Each observation passes the critic's features extractor once. The critic is in evaluation mode meanwhile.
 
         :param observation: a batch of B observations, as tensors
         :param critic: the critic, or the target critic

@@ -133,7 +133,7 @@ class CudaGraphAlgorithm(CGP):
         self._unlogged.update(losses)
         # The core's `train` notes these two, which no replay does
         if "actor_loss" in losses:
-            self._note_trained_policy()
+            self._mark_policy(is_trained=True)
         self._policy_is_due = self.policy_training == "offline"
         if self._n_updates // CHECK_INTERVAL > n_updates_before // CHECK_INTERVAL:
             self._loss_watch.check()

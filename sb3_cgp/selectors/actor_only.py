@@ -11,7 +11,8 @@ class ActorOnly:
     """
     Selects the actor's action, and never asks the critic.
 
-    With it, ``CGP(..., policy_loss="qgp", policy_delay=2)`` is TD3, and a comparison with CEM leaves all else equal.
+    With it, ``CGP(..., policy_loss="qgp", policy_delay=2)`` is TD3, and a comparison with CEM leaves all else equal. Its
+    rollouts explore by ``action_noise`` alone, as TD3's do.
     """
 
     takes_proposals = True

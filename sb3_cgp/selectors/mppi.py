@@ -17,7 +17,8 @@ class MPPI:
     Fits each next Gaussian to the elites weighted by the softmax of their values, as TD-MPC2 does.
 
     Values are divided by their standard deviation over the state's samples, so that the temperature does not depend on
-    the scale of rewards. With a high temperature all elites count alike, as in CEM; with a low one only the best.
+    the scale of rewards. With a high temperature all elites count alike, as in CEM; with a low one only the best. As it uses
+    more than the order of the values, give ``CGP`` ``cem_dtype="float32"``: bfloat16 rounds them.
 
     :param iterations: number of iterations, at least 1
     :param samples: number of samples per state and iteration, at least 1
@@ -70,7 +71,8 @@ class MPPI:
         """
         Maximise ``score`` for each state, with random numbers of PyTorch's global generator.
 
-        The parameters are those of :class:`~sb3_cgp.selectors.ProposalSelector`. A NaN score ranks last.
+        The parameters are those of :class:`~sb3_cgp.selectors.ProposalSelector`. A NaN score ranks last, and one that is not
+        finite has no weight where another elite's is finite.
 
         :return: the selected actions (B, A) and the last elites (B, K, A)
         """
@@ -95,9 +97,16 @@ class MPPI:
     def _weigh_elites(self, values: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Return the elites' indices, best first, and their weights, the softmax of standardised values: (B, K, 1) each."""
         winners = find_elites(values, self.elites)
-        scale = values.std(dim=1, unbiased=False, keepdim=True).unsqueeze(2)
-        weights = (take(values.unsqueeze(2), winners) / (scale * self.temperature)).softmax(dim=1)
-        # Equal ones where all values are equal, or one is not finite
+        is_finite = values.isfinite()
+        number = is_finite.sum(dim=1, keepdim=True).clamp(min=1)
+        mean = values.where(is_finite, 0.0).sum(dim=1, keepdim=True) / number
+        deviations = (values - mean).where(is_finite, 0.0)
+        scale = (deviations.square().sum(dim=1, keepdim=True) / number).sqrt().unsqueeze(2) * self.temperature
+        elites = take(values.where(is_finite, -th.inf).unsqueeze(2), winners)
+        # Where all values are equal, the scale is 0, and so are all differences
+        differences = (elites - elites.amax(dim=1, keepdim=True)) / scale.clamp(min=th.finfo(scale.dtype).tiny)
+        weights = differences.softmax(dim=1)
+        # Equal ones where no elite's value is finite
         return winners, weights.where(weights.isfinite().all(dim=1, keepdim=True), 1 / self.elites)
 
 
