@@ -1,5 +1,6 @@
 """The verdicts on the paper's claims, on runs whose truth is known."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -241,6 +242,23 @@ def test_the_page_of_a_users_own_sweep_has_no_claims_without_data(tmp_path: Path
     assert own == ["## The paper's claims", "", sentence, ""]
     assert "Figure numbers in headings are the paper's" not in text
     assert "benchmark.runtime" not in text
+
+
+def test_the_time_of_inference_is_that_measured_beside_the_page(tmp_path: Path) -> None:
+    """The record of ``benchmark.runtime`` in the repository is of other machines than a user's."""
+    own = write_study(tmp_path / "sweeps/e1", runs(scores(CGP_Online=50, CEM=20), ["CGP-Online", "CEM"]))
+
+    def claim() -> str:
+        text = unpadded(figures([own], tmp_path / "sweeps", 10).read_text())
+        (row,) = (line for line in text.splitlines() if "inference cost is independent" in line)
+        return row
+
+    assert "no data" in claim()
+    times = {"CGP-2": [1.0, 1.0, 1.0], "CGP-4": [1.0, 1.0, 1.0]}
+    record = {"methods": {name: {"inference": {"seconds": {"all": seconds}}} for name, seconds in times.items()}}
+    (tmp_path / "runtime").mkdir()
+    (tmp_path / "runtime/runtime.json").write_text(json.dumps(record))
+    assert "takes 1.00 (1.00 to 1.00) times as long" in claim()
 
 
 def test_the_page_of_a_users_own_sweep_has_the_claims_on_which_it_has_data(tmp_path: Path) -> None:

@@ -26,7 +26,6 @@ from benchmark.reporting.sections import Picture, study_sections
 from benchmark.reporting.side_runs import without_side_runs
 from sb3_cgp.common.files import write_atomically
 
-RUNTIME = Path(__file__).parent.parent / "results/runtime/runtime.json"
 PAGE = "results.md"
 FIGURES = "figures"
 CURVES = (
@@ -143,10 +142,10 @@ def read_runtime(out: Path) -> dict[str, Any] | None:
     Read the record of ``benchmark.runtime``.
 
     :param out: the folder of the page
-    :return: the record in the folder beside it, or this repository's; None without one
+    :return: the record in the folder beside it; None without one
     """
-    own = out.parent / "runtime/runtime.json"
-    return next((json.loads(path.read_text()) for path in (own, RUNTIME) if path.is_file()), None)
+    path = out.parent / "runtime/runtime.json"
+    return json.loads(path.read_text()) if path.is_file() else None
 
 
 def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:

@@ -47,7 +47,7 @@ SHARES = (
 # What the page adds where it judges the paper's claims
 WITH_CLAIMS = {
     "claims": " and the claims use",
-    "papers": "\nThe time of inference was measured separately, by `python -m benchmark.runtime`. "
+    "papers": "\nThe time of inference is measured separately, by `python -m benchmark.runtime`. "
     "Figure numbers in headings are the paper's.",
 }
 WITHOUT_CLAIMS = {"claims": " uses", "papers": ""}
