@@ -103,6 +103,11 @@ def test_page_averages_the_second_half_of_the_training():
     assert "| TD3 | 0, 1 | 11.0 (6.0 to 16.0) | 10.0 (5.0 to 15.0) | 21.0 (16.0 to 26.0) | 10.0 (10.0 to 10.0) |" in text
     assert "the 2 measurements in the second half of 100 steps on Env-v0" in " ".join(text.split())
     assert "no bias by more than 0.25 (0 if" in " ".join(text.split())
+    searched = record(2, 15.0)
+    searched["points"][-1]["cem"] = measured(1.0, 1.0) | {"error_bound": 0.5}
+    # Not in the second half
+    searched["points"][0]["cem"] = measured(1.0, 1.0) | {"error_bound": 0.75}
+    assert "no bias by more than 0.5 (0 if" in " ".join(bias_page.markdown([record(0, 15.0), searched]).split())
 
 
 def test_horizon():

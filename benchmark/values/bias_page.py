@@ -137,7 +137,13 @@ def markdown(records: list[dict[str, Any]]) -> str:
             ]
         )
     settings = records[0]["settings"]
-    bounds = [point["actor"]["error_bound"] for record in records for point in late(record)]
+    bounds = [
+        point[policy]["error_bound"]
+        for record in records
+        for point in late(record)
+        for policy in ("actor", "cem")
+        if policy in point
+    ]
     notes = NOTES.format(
         **settings,
         horizon=horizon(settings["gamma"]),
