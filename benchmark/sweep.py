@@ -1,5 +1,5 @@
 """
-Execute a sweep, or continue it: ``python -m benchmark.sweep e3 --task Pendulum-v1 --steps 3000 --seeds 2 --workers 2``.
+Execute a sweep, or continue it: ``python -m benchmark.sweep e3 --task Pendulum-v1 --steps 1000 --seeds 2 --workers 2``.
 
 The runs are trials of an Optuna study. The same command, given again after any interruption, or on other machines with the
 same ``--storage``, trains the runs that are left. At the end it exports the runs and draws the figures.
@@ -28,11 +28,11 @@ from benchmark.sweeps.validation import SweepError
 
 EXAMPLES = """\
 examples:
-  python -m benchmark.sweep e3 --task Pendulum-v1 --steps 3000 --seeds 2 --workers 2
+  python -m benchmark.sweep e3 --methods CGP-Online QGP-Online --task Pendulum-v1 --steps 1000 --seeds 2 --workers 2
   python -m benchmark.sweep e4 --task Pendulum-v1 --steps 3000 --seeds 1 --set "policy_kwargs=dict(net_arch=[64, 64])"
   python -m benchmark.sweep mine.yml --workers 2"""
 DURATION = """\
-The first example takes an hour on two cores. With a million steps on HalfCheetah-v5, a run of CGP takes 12 hours on a core of
+The first example takes ten minutes on two cores. With a million steps on HalfCheetah-v5, a run of CGP takes 12 hours on a core of
 an AMD EPYC, and one of TD3 about two hours; e1 is 200 runs. --steps shortens runs; at most a tenth of a shortened run
 is random, unless --set learning_starts=... sets the number. After an interruption, the same command continues."""
 RESULTS = """\
