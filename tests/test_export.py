@@ -67,6 +67,22 @@ EXPORTS = {
 }
 
 
+@pytest.mark.parametrize("is_dict", [False, True])
+def test_a_space_of_all_float64_is_exported_though_it_cannot_be_sampled(is_dict, tmp_path):
+    """Gymnasium's ``sample`` overflows."""
+    widest = np.finfo(np.float64).max
+    box = spaces.Box(np.array([-widest, -1.0]), np.array([widest, widest]), dtype=np.float64)
+    with pytest.raises(OverflowError):
+        box.sample()
+    policy, space = ("MultiInputPolicy", spaces.Dict(x=box)) if is_dict else ("MlpPolicy", box)
+    model = make_model(policy=policy, observation_space=space)
+    model.export(tmp_path)
+    observation = np.array([0.5, 0.2])
+    observation = {"x": observation} if is_dict else observation
+    found, expected = (each.predict(observation)[0] for each in (CGP.load_weights(tmp_path), model))
+    assert np.allclose(found, expected, rtol=1e-5, atol=1e-5)
+
+
 @pytest.mark.parametrize("name", EXPORTS)
 def test_exports_act_as_predict_does(name, tmp_path):
     model = make_model(**EXPORTS[name])

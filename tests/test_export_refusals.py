@@ -1,5 +1,6 @@
 """What is not exported, and what an exported policy refuses."""
 
+import functools
 import re
 
 import numpy as np
@@ -68,6 +69,10 @@ class FlattenTwice(nn.ReLU):
         (
             dict(policy_kwargs=dict(activation_fn=FlattenTwice)),
             "`activation_fn` is .*FlattenTwice.*, but must be one of ReLU, ",
+        ),
+        (
+            dict(policy_kwargs=dict(activation_fn=functools.partial(nn.LeakyReLU, 0.1))),
+            r"`activation_fn` is functools.partial.*LeakyReLU.*, but must be one of ReLU, ",
         ),
         (dict(policy_kwargs=dict(activation_fn=nn.PReLU)), "`activation_fn` is .*PReLU.*, but must be one of ReLU, "),
         (dict(observation_space=spaces.Discrete(3)), r"`observation_space` is Discrete\(3\), but must be a Box"),

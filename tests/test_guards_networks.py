@@ -157,6 +157,17 @@ def test_observations_of_every_space_of_sb3_pass_the_trial(space, algorithm):
     assert model.learn(9)._n_updates > 0
 
 
+@pytest.mark.parametrize("is_dict", [False, True])
+def test_observations_of_a_space_that_cannot_be_sampled_pass_the_trial(is_dict):
+    """Gymnasium's ``sample`` overflows."""
+    widest, env = np.finfo(np.float64).max, Located()
+    box = spaces.Box(-widest, widest, (2,), np.float64)
+    env.observation_space = spaces.Dict(x=box) if is_dict else box
+    env.observe = lambda: {"x": np.ones(2)} if is_dict else np.ones(2)
+    policy = "MultiInputPolicy" if is_dict else "MlpPolicy"
+    assert GuardedTD3(policy, DummyVecEnv([lambda: env]), **(SMALL | dict(buffer_size=20))).learn(9)._n_updates > 0
+
+
 def test_hindsight_needs_goals_and_their_rewards():
     arguments = SMALL | dict(replay_buffer_class=HerReplayBuffer)
     with pytest.raises(ValueError, match=r"`observation_space` is .*, but must be a Dict with the keys 'observation'"):

@@ -1,4 +1,4 @@
-"""The rule on action spaces that acting, training and exported policies share."""
+"""Action and observation spaces, as acting, training and exported policies share them."""
 
 from typing import Any
 
@@ -33,3 +33,21 @@ def check_action_space(action_space: spaces.Space[Any]) -> None:
         is_scalable = bool(np.all(np.isfinite(high - low)))
     allowed = f"of bounds whose difference `high - low` is finite in {action_space.dtype}: give the environment closer bounds"
     require(is_scalable, "action_space", action_space, allowed)
+
+
+def sample_of(space: spaces.Space[Any]) -> Any:
+    """
+    Draw a random observation, also from a float64 ``Box`` whose bounds are so wide that Gymnasium's ``sample`` overflows.
+
+    Bounds beyond float32, in which observations are replayed, count as none.
+
+    :param space: the observation space, whose random numbers are used
+    :return: the observation
+    """
+    if isinstance(space, spaces.Dict):
+        return {key: sample_of(subspace) for key, subspace in space.items()}
+    largest = np.finfo(np.float32).max
+    if not isinstance(space, spaces.Box) or space.dtype != np.float64:
+        return space.sample()
+    low, high = np.where(space.low < -largest, -np.inf, space.low), np.where(space.high > largest, np.inf, space.high)
+    return spaces.Box(low, high, dtype=np.float64, seed=space.np_random).sample()

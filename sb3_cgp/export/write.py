@@ -16,6 +16,7 @@ from stable_baselines3.td3.policies import Actor
 from sb3_cgp.common.extras import import_from_extra
 from sb3_cgp.common.files import replace_all
 from sb3_cgp.common.rules import require
+from sb3_cgp.common.spaces import sample_of
 from sb3_cgp.common.statistics import WITH_STATISTICS, count_observations
 from sb3_cgp.common.version import __version__
 from sb3_cgp.export.boxes import (
@@ -159,7 +160,8 @@ def _describe(model: ExportableModel, normalizer: VecNormalize | None) -> dict[s
         ("activation_fn", actor.activation_fn, ACTIVATIONS),
         ("features_extractor_class", type(actor.features_extractor), EXTRACTORS),
     ):
-        require(allowed.get(value.__name__) is value, name, value, f"one of {', '.join(allowed)} to be exported")
+        is_known = any(value is each for each in allowed.values())
+        require(is_known, name, value, f"one of {', '.join(allowed)} to be exported")
     try:
         extractor_kwargs = json.loads(json.dumps(policy.features_extractor_kwargs, allow_nan=False))
     except (TypeError, ValueError) as error:
@@ -216,7 +218,7 @@ def _observations(space: ObservationSpace, normalizer: VecNormalize | None) -> O
     space.seed(0)
     boxes = boxes_of(space)
     samples: Observations = {
-        name: np.stack([box.sample() for _ in range(CHECKED_OBSERVATIONS)]) for name, box in boxes.items()
+        name: np.stack([sample_of(box) for _ in range(CHECKED_OBSERVATIONS)]) for name, box in boxes.items()
     }
     if not isinstance(space, spaces.Dict):
         samples = samples[OBSERVATION]

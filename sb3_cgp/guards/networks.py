@@ -15,6 +15,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cgp.common.random_state import preserved_random_state
 from sb3_cgp.common.rules import require
+from sb3_cgp.common.spaces import sample_of
 from sb3_cgp.guards.observations import innermost
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -209,7 +210,7 @@ def _make_observations(space: spaces.Space, batch_size: int, device: th.device, 
     # A copy, as the space has random numbers of its own
     space = copy.deepcopy(space)
     space.seed(0)
-    samples = [space.sample() if is_random else _near_zero(space) for _ in range(batch_size)]
+    samples = [sample_of(space) if is_random else _near_zero(space) for _ in range(batch_size)]
     shape = get_obs_shape(space)
 
     def stack(values: list[Any], each_shape: tuple[int, ...]) -> th.Tensor:
