@@ -12,6 +12,7 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
@@ -102,8 +103,8 @@ class PopulationPolicy(BasePolicy):
         arguments = {}
         if self.actor_proposes and takes_proposals(self.selector):
             arguments["proposals"] = actors(features)[0].flatten(0, 1).unsqueeze(1)
-        assert isinstance(self.action_space, spaces.Box) and self.selector is not None  # noqa: PT018
-        n_rows, action_dim = features.shape[0] * features.shape[1], int(self.action_space.shape[0])
+        assert self.selector is not None
+        n_rows, action_dim = features.shape[0] * features.shape[1], get_action_dim(self.action_space)
         selection = self.selector.select(critics.score(features), n_rows, action_dim, features.device, **arguments)
         return selection.actions.unflatten(0, features.shape[:2])
 
