@@ -77,6 +77,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
         self.cuda_graphs = self.agents[0].get("cuda_graphs", True)
         self._failures: list[str | None] = [None] * len(self.agents)
         self._agent_updates = np.zeros(len(self.agents), dtype=np.int64)
+        self._policies_trained, self._policies_due = (np.zeros(len(self.agents), dtype=bool) for _ in range(2))
         first = self.agents[0]
         super().__init__(
             policy,
@@ -169,7 +170,8 @@ class Population(ResumableAlgorithm, PopulationMembers):
         progress_bar: bool = False,
     ) -> SelfPopulation:
         """
-        Learn as SB3's algorithms do. With offline training, train the agents' policies at the end, one after another.
+        Learn as SB3's algorithms do. With offline training, train the actors at the end, one after another: those of the
+        agents whose critics have learnt.
 
         :param total_timesteps: number of steps of all environments together
         :param callback: callback(s) called at every step with state of the algorithm.
@@ -183,8 +185,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         self._report_failures()
         # A loaded population has no transitions if a callback stopped `learn` at its first step
-        has_data = self.replay_buffer is not None and self.replay_buffer.size() > 0 and self._agent_updates.any()
-        if self._policy_loss is not None and not self._trains_online and has_data:
+        if self.replay_buffer is not None and self.replay_buffer.size() > 0:
             self._train_policies()
         return self
 
