@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 
-from sb3_cgp import TrainingCheckpointCallback
+from sb3_cgp import CGP, TrainingCheckpointCallback
 from sb3_cgp.population import Population
 
 
@@ -52,6 +52,28 @@ def test_the_name_of_an_environment_stands_for_one_of_each_agent(tmp_path):
     np.testing.assert_array_equal(loaded[0].replay_buffer.observations[0], first)
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         Population.load(saved[0], env="MountainCarContinuous-v0")
+
+
+@pytest.mark.parametrize("opened", [False, True])
+def test_a_population_and_an_agent_are_not_loaded_as_each_other(opened, tmp_path):
+    population = make(2)
+    population.save(tmp_path / "population")
+    agent = population[0]
+    # An attribute of the user's makes no population
+    agent.agents = 3
+    agent.save(tmp_path / "agent")
+
+    def saved(name):
+        return io.BytesIO((tmp_path / f"{name}.zip").read_bytes()) if opened else tmp_path / name
+
+    with pytest.raises(
+        ValueError, match=r"with the attribute `agents`.* must be of CGP, .*`sb3_cgp.population.Population.load"
+    ):
+        CGP.load(saved("population"), env=make_env(2))
+    with pytest.raises(ValueError, match=r"without the attribute `agents`.* must be of Population, .*`CGP.load\(path\)`"):
+        Population.load(saved("agent"), env=make_env(2))
+    assert CGP.load(saved("agent")).agents == 3
+    assert len(Population.load(saved("population"))) == 2
 
 
 class Stop(BaseCallback):
