@@ -97,6 +97,15 @@ def test_agents_are_trained_again_only_after_their_critics_have_learnt(tmp_path)
         assert [has_changed(model, before, index) for index in range(3)] == [True, False, True]
 
 
+def test_loaded_parameters_of_trained_actors_act():
+    population = make_offline(LATE).learn(3 * 40)
+    fresh = make_offline(LATE)
+    assert fresh.policy.inference == "cem"
+    fresh.set_parameters(population.get_parameters())
+    assert [agent.policy.inference for agent in fresh] == ["actor", "cem", "actor"]
+    np.testing.assert_array_equal(fresh.predict(OBSERVATIONS)[0][[0, 2]], population.predict(OBSERVATIONS)[0][[0, 2]])
+
+
 def test_a_failed_agent_keeps_the_actor_that_it_had(monkeypatch):
     population = make_offline(2).learn(2 * 40)
     before = copy_weights(population)

@@ -1,8 +1,10 @@
 """The agents of a population as ordinary CGPs."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_cgp.algorithm import CGP
@@ -20,6 +22,20 @@ class PopulationMembers(OverlappedTraining):
         has_actor = self._policies_trained | self._trains_online
         self.policy.inference = (self.agents[0].get("inference") or "actor") if has_actor.any() else "cem"
         self.policy.set_actors(has_actor)
+
+    def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto") -> None:
+        """
+        Load parameters, see SB3's method. As in a CGP alone, the loaded actors of agents that have not learnt yet then act if
+        their optimizers' states show that they have been trained.
+
+        :param load_path_or_dict: path to the file, an open file, or the parameters by module
+        :param exact_match: whether the parameters of every module must be given
+        :param device: the device on which the parameters are loaded
+        """
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        steps = self.policy.actor_optimizer.steps.flatten().numpy(force=True)
+        self._policies_trained |= (steps > 0) & (self._agent_updates == 0) & self._trains_offline
+        self._choose_inference()
 
     def __len__(self) -> int:
         return len(self.agents)
