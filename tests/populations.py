@@ -3,6 +3,7 @@
 import numpy as np
 import torch as th
 from environments import Doubles
+from gymnasium import spaces
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
@@ -56,6 +57,20 @@ class Pushed(Doubles):
     def step(self, action):
         observation, _, *rest = super().step(action)
         return observation, float(action @ observation[:2]), *rest
+
+
+class PushedOnAxes(Pushed):
+    """The same, with actions and observations of several axes."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (3, 2), np.float64)
+    action_space = spaces.Box(-np.ones((2, 2), np.float32), 3.0, (2, 2), np.float32)
+
+    def observe(self):
+        return self.np_random.normal(size=(3, 2))
+
+    def step(self, action):
+        observation, _, *rest = Doubles.step(self, action)
+        return observation, float((action * observation[:2]).sum()), *rest
 
 
 def make_env(n_envs=3, env=Pushed):

@@ -5,9 +5,11 @@ import functools
 import numpy as np
 import pytest
 import torch as th
-from populations import AGENTS, Pushed, assert_alike, make
+from populations import AGENTS, Pushed, PushedOnAxes, assert_alike, make
+from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_cgp import CGP
+from sb3_cgp.population import make_population_env
 
 
 def test_an_agent_predicts_as_it_does_in_the_population():
@@ -34,6 +36,28 @@ def test_an_agent_saves_loads_and_exports(tmp_path):
         agent.export(tmp_path / f"export{index}")
         exported, _ = CGP.load_weights(tmp_path / f"export{index}").predict(observation)
         np.testing.assert_allclose(exported, expected, atol=1e-5)
+
+
+def test_agents_act_learn_and_export_with_actions_of_several_axes(tmp_path):
+    pytest.importorskip("onnx")
+    pytest.importorskip("safetensors")
+    # Agent 1 alone has noise: zero noise of the same shape stands for the other's
+    agents = [dict(), dict(action_noise=NormalActionNoise(np.zeros((2, 2)), 0.1 * np.ones((2, 2))))]
+    env = make_population_env(PushedOnAxes, 2, n_processes=2, start_method="fork")
+    try:
+        population = make(agents, env).learn(2 * 40)
+    finally:
+        env.close()
+    observations = np.random.default_rng(0).normal(size=(2, 3, 2))
+    actions, _ = population.predict(observations)
+    assert actions.shape == (2, 2, 2)
+    for index in range(2):
+        agent = population.agent(index, env=PushedOnAxes())
+        np.testing.assert_allclose(agent.predict(observations[index])[0], actions[index], atol=1e-6)
+        agent.learn(10, reset_num_timesteps=False)
+        agent.export(tmp_path / f"{index}")
+        exported, _ = CGP.load_weights(tmp_path / f"{index}").predict(observations[index])
+        np.testing.assert_allclose(exported, agent.predict(observations[index])[0], atol=1e-5)
 
 
 def test_a_copy_of_an_agent_changes_neither_the_population_nor_its_random_numbers():

@@ -22,6 +22,8 @@ from sb3_cgp.population import Population, evaluate_population
         (lambda: make([dict(), dict(batch_size=16)]), "agents[1]['batch_size']"),
         (lambda: make([dict(), dict(cem_samples=16)]), "agents[1]['cem_samples']"),
         (lambda: make([dict(), dict(n_steps=2)]), "agents[1]['n_steps']"),
+        (lambda: make([dict(n_steps=2), dict()]), "agents[1]['n_steps']"),
+        (lambda: make([dict(), dict(train_freq=(2, "step"))]), "agents[1]['train_freq']"),
         (lambda: make([dict(), dict(policy_kwargs=dict(net_arch=[4]))]), "agents[1]['policy_kwargs']"),
         (lambda: make([dict(), dict(policy_training="offline")]), "agents[1]['policy_training']"),
         (lambda: make([dict(), dict(learning_speed=1)]), "arguments"),
@@ -61,6 +63,23 @@ def test_what_is_not_possible_is_refused_by_name(make_it, name):
     with pytest.raises(ValueError, match="must be") as error:
         make_it()
     assert f"`{name}`" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        dict(n_steps=1),
+        dict(train_freq=(1, "step")),
+        dict(policy_loss="cgp", policy_training="online", inference=None, cuda_graphs=True),
+        dict(replay_buffer_kwargs={}),
+    ],
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_a_default_that_one_agent_is_given_is_no_difference(given, first):
+    agents = [given, dict()] if first else [dict(), given]
+    population = make(agents)
+    assert (population.n_steps, population.train_freq.frequency) == (1, 1)
+    assert len({agent.policy.inference for agent in population}) == 1
 
 
 def test_the_selector_is_unchanged():

@@ -48,6 +48,13 @@ def test_sb3s_callbacks_and_log_take_a_population(tmp_path):
     assert logged["eval/mean_reward"] == evaluation.last_mean_reward
 
 
+def test_the_evaluation_of_a_population_refuses_a_single_agent():
+    agent = make(1).agent(0, env=make_env(1))
+    with pytest.raises(ValueError, match=r"`model` is 'CGP', but must be a Population.* use SB3's EvalCallback"):
+        agent.learn(5, callback=PopulationEvalCallback(make_env(1)))
+    assert agent.num_timesteps == 0
+
+
 class Log(KVWriter):
     """Keeps what is logged."""
 

@@ -26,6 +26,26 @@ def test_recorded_gradient_steps_are_the_ordinary_ones(variant, monkeypatch):
         assert th.equal(recorded.policy.state_dict()[name], value), name
 
 
+@pytest.mark.usefixtures("short_policy_training")
+@pytest.mark.filterwarnings("ignore:The policy's loss has not reached a plateau", "ignore:Agent 1 learns nothing")
+def test_recorded_gradient_steps_ask_the_actors_that_are_trained(monkeypatch):
+    def train():
+        # The second agent's actor is trained at the end of the second training
+        population = make([dict(), dict(learning_starts=50)], **VARIANTS["from the actor, offline"])
+        for _ in range(3):
+            population.learn(2 * 40, reset_num_timesteps=False)
+        return population
+
+    ordinary = train()
+    monkeypatch.setattr(training, "has_cuda_graphs", lambda device: True)
+    monkeypatch.setattr(cuda_graphs, "Recording", StandIn)
+    recorded = train()
+    assert {has_actor for *_, has_actor in recorded._recorded} == {(False, False), (True, False), (True, True)}
+    assert not any(each._stays_eager for each in recorded._recorded.values())
+    for name, value in ordinary.policy.state_dict().items():
+        assert th.equal(recorded.policy.state_dict()[name], value), name
+
+
 @pytest.mark.usefixtures("gpu")
 @pytest.mark.parametrize("variant", ["CGP", "QGP", "CGP-Light", "MPPI from the actor", "TD3", "CEM", "n-step"])
 def test_on_a_gpu_gradient_steps_are_recorded_and_compute_the_same(variant):

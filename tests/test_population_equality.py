@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import torch as th
-from populations import AGENTS, VARIANTS, Pushed, adam_state, assert_alike, make, make_env
+from populations import AGENTS, VARIANTS, Pushed, PushedOnAxes, adam_state, assert_alike, make, make_env
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
@@ -122,13 +122,18 @@ def test_an_agent_is_a_cgp_alone_in_single_precision_too(variant, monkeypatch):
             th.testing.assert_close(agent.policy.state_dict()[name], value, rtol=0, atol=2e-3, msg=name)
 
 
-@pytest.mark.parametrize("variant", ["CGP", "QGP", "CEM", "CGP-Light", "MPPI from the actor", "TD3", "n-step"])
-def test_a_population_of_one_is_a_cgp_alone_from_the_first_step(variant, float64):
+@pytest.mark.parametrize(
+    ("variant", "env"),
+    [(name, Pushed) for name in ("CGP", "QGP", "CEM", "CGP-Light", "MPPI from the actor", "TD3", "n-step")]
+    + [(name, PushedOnAxes) for name in ("CGP", "CGP-Light", "MPPI from the actor", "TD3", "n-step")],
+)
+def test_a_population_of_one_is_a_cgp_alone_from_the_first_step(variant, env, float64):
     """Environment, warm-up, acting, noise, minibatches and gradient steps, on the same random numbers."""
+    noise = NormalActionNoise(np.zeros(env.action_space.shape), 0.1 * np.ones(env.action_space.shape))
     # A gamma that is exact in single precision, to which the core rounds it
-    kwargs = VARIANTS[variant] | dict(action_noise=NormalActionNoise(np.zeros(2), 0.1 * np.ones(2)), gamma=0.5)
-    population = make(1, **kwargs).learn(230)
-    alone = CGP("MlpPolicy", make_env(1), **population.agents[0], device="cpu").learn(230)
+    kwargs = VARIANTS[variant] | dict(action_noise=noise, gamma=0.5)
+    population = make(1, make_env(1, env), **kwargs).learn(230)
+    alone = CGP("MlpPolicy", make_env(1, env), **population.agents[0], device="cpu").learn(230)
     assert alone._n_updates == 210
     np.testing.assert_allclose(population.replay_buffer.actions[:230], alone.replay_buffer.actions[:230], atol=1e-4)
     np.testing.assert_array_equal(population.replay_buffer.observations[:230], alone.replay_buffer.observations[:230])

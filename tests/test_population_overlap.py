@@ -1,5 +1,8 @@
 """Gradient steps that a population takes while its environments take their step."""
 
+import copy
+import pickle
+
 import pytest
 import torch as th
 from populations import AGENTS, VARIANTS, Pushed, make, make_env
@@ -91,6 +94,22 @@ def test_a_training_that_a_callback_ended_is_followed_by_a_whole_one():
     assert population._n_updates == 5
     population.learn(2 * 30)
     assert population._n_updates == 5 + 10
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda model: pickle.loads(pickle.dumps(model))])
+def test_a_population_is_copied_within_learn_and_after_it(copied):
+    copies = []
+    population = make(2, overlap=True)
+    population.learn(2 * 30, Do(25, lambda: copies.append(copied(population))))
+    copies.append(copied(population))
+    assert [each._n_updates for each in copies] == [5, 10]
+    before = copy.deepcopy(population.policy.state_dict())
+    for each, n_updates in zip(copies, (15, 20), strict=True):
+        each.learn(2 * 10, reset_num_timesteps=False)
+        assert each._n_updates == n_updates
+    # The copies have trained themselves
+    assert population._n_updates == 10
+    assert all(th.equal(value, before[name]) for name, value in population.policy.state_dict().items())
 
 
 def test_it_resumes_as_if_it_had_not_stopped(tmp_path):

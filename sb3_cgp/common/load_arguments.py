@@ -77,22 +77,33 @@ def saved_attribute_names(saved: SavedModel) -> set[str]:
     :param saved: the path of the saved model, or an open file, whose position is restored
     :return: the names; none for a file that ``load`` refuses, with an error of its own
     """
+    return set(saved_attributes(saved))
+
+
+def saved_attributes(saved: SavedModel) -> dict[str, Any]:
+    """
+    Return the attributes that a saved model holds, by name, without unpickling it.
+
+    :param saved: the path of the saved model, or an open file, whose position is restored
+    :return: the attributes, as JSON has them: those that are pickled, as the pickle; none for a file that ``load`` refuses,
+        with an error of its own
+    """
     try:
         if isinstance(saved, io.BufferedIOBase):
             position = saved.tell()
             try:
-                return _names(saved)
+                return _attributes_in(saved)
             finally:
                 saved.seek(position)
         with open_path(saved, "r", suffix="zip") as file:
-            return _names(file)
+            return _attributes_in(file)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile):
-        return set()
+        return {}
 
 
-def _names(file: Any) -> set[str]:
+def _attributes_in(file: Any) -> dict[str, Any]:
     with zipfile.ZipFile(file) as archive:
-        return set(json.loads(archive.read("data")))
+        return dict(json.loads(archive.read("data")))
 
 
 def _attributes(algorithm: type[BaseAlgorithm]) -> set[str]:

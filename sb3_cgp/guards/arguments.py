@@ -12,14 +12,17 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Event
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
-from sb3_cgp.common.load_arguments import check_load_arguments, misspelt_custom_objects
+from sb3_cgp.common.load_arguments import SavedModel, check_load_arguments, misspelt_custom_objects, saved_attribute_names
 from sb3_cgp.common.rules import require
+from sb3_cgp.common.sb3_arguments import constructor_argument_names
 from sb3_cgp.guards.construction import check_constructor_arguments
 
 SelfArgumentGuard = TypeVar("SelfArgumentGuard", bound="ArgumentGuard")
 
 # The attributes in which SB3's CallbackList and EventCallback hold other callbacks
 SLOTS = ("callbacks", "callback", "callback_on_new_best")
+# Arguments that populations of agents have, and no other algorithm has
+POPULATION_ARGUMENTS = {"agents", "overlap"}
 CALLBACK = "an instance of a subclass of BaseCallback"
 
 
@@ -70,8 +73,10 @@ class ArgumentGuard(OffPolicyAlgorithm):
         :param kwargs: arguments to change in the model
         :return: the model
         :raises TypeError: if a model has no such argument or attribute, naming it and the nearest one that is allowed
-        :raises ValueError: if the value of an argument of SB3's is wrong, naming it
+        :raises ValueError: if the value of an argument of SB3's is wrong, naming it, or if the file holds a population and the
+            class is that of one agent, or the reverse
         """
+        check_holds(cls, path)
         check_load_arguments(cls, path, kwargs)
         check_constructor_arguments(kwargs | {"device": device})
         if "policy" in kwargs:
@@ -93,6 +98,26 @@ class ArgumentGuard(OffPolicyAlgorithm):
                 raise
             # The policy is the saved one
             raise ValueError(f"{error} Load a model of another algorithm by that algorithm's class.") from error
+
+
+def check_holds(algorithm: type[OffPolicyAlgorithm], saved: SavedModel) -> None:
+    """
+    Check that a saved model is a population if the algorithm trains one, and else is none.
+
+    :param algorithm: the algorithm's class
+    :param saved: the path of the saved model, or an open file; a file that cannot be read is left to ``load``
+    :raises ValueError: if it is the other
+    """
+    attributes = saved_attribute_names(saved)
+    is_population = attributes >= POPULATION_ARGUMENTS
+    takes_population = constructor_argument_names(algorithm) >= POPULATION_ARGUMENTS
+    if not attributes or is_population == takes_population:
+        return
+    found, remedy = "without the attribute `agents`", "a single agent is loaded by its own class, such as `CGP.load(path)`"
+    if is_population:
+        found, remedy = "with the attribute `agents`", "load a population by `sb3_cgp.population.Population.load(path)`"
+    allowed = f"of {algorithm.__name__}, which {'trains a population' if takes_population else 'is a single agent'}: {remedy}"
+    require(False, "path", f"a file {found}", allowed)
 
 
 def as_total_timesteps(value: Any) -> int:

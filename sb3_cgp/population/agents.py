@@ -35,7 +35,8 @@ OWN = (
 )
 # The arguments that a population has in their place
 NOT_AGENTS = ("self", "policy", "env", "device", "_init_setup_model")
-COMMON = tuple(name for name in inspect.signature(CGP.__init__).parameters if name not in (*OWN, *NOT_AGENTS))
+DEFAULTS = {name: each.default for name, each in inspect.signature(CGP.__init__).parameters.items()}
+COMMON = tuple(name for name in DEFAULTS if name not in (*OWN, *NOT_AGENTS))
 # The policies whose networks and scoring a population computes
 POLICIES = (core_policies.CGPPolicy, selector_policies.CGPPolicy, fast_policies.CGPPolicy)
 
@@ -63,13 +64,20 @@ def merge_arguments(agents: int | Sequence[Arguments], common: Arguments) -> lis
         check_constructor_arguments(each)
     seed = common.get("seed")
     seeds = [{} if seed is None else {"seed": seed + index} for index in range(len(agents))]
-    merged = [_with_plain_seed(common | seeds[index] | own) for index, own in enumerate(agents)]
-    for name in COMMON:
-        for index, arguments in enumerate(merged):
-            allowed = f"{merged[0].get(name)!r}, as agent 0 has it: agents that differ in `{name}` make several populations"
-            require(arguments.get(name) == merged[0].get(name), f"agents[{index}]['{name}']", arguments.get(name), allowed)
     # JSON, in which SB3 saves, has no tuples
-    return [_with_plain_train_freq(arguments) for arguments in merged]
+    merged = [_with_plain_train_freq(_with_plain_seed(common | seeds[index] | own)) for index, own in enumerate(agents)]
+    for name in COMMON:
+        first, *others = (_value_of(name, arguments) for arguments in merged)
+        for index, value in enumerate(others, start=1):
+            allowed = f"{first!r}, as agent 0 has it: agents that differ in `{name}` make several populations"
+            require(value == first, f"agents[{index}]['{name}']", value, allowed)
+    return merged
+
+
+def _value_of(name: str, arguments: Arguments) -> Any:
+    """Return the value of an argument, or its default. No keyword arguments are an empty dictionary of them."""
+    value = arguments.get(name, DEFAULTS[name])
+    return {} if value is None and name.endswith("_kwargs") else value
 
 
 def _with_plain_seed(arguments: Arguments) -> Arguments:

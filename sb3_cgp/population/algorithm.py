@@ -7,11 +7,11 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_cgp.algorithm import CGP
+from sb3_cgp.common.load_arguments import saved_attributes
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import as_schedule
 from sb3_cgp.core.policies import CGPPolicy
@@ -29,6 +29,7 @@ from sb3_cgp.population.agents import (
     merge_arguments,
 )
 from sb3_cgp.population.gradient_step import AgentNumbers
+from sb3_cgp.population.make_environments import make_agents_env
 from sb3_cgp.population.members import PopulationMembers
 from sb3_cgp.population.policies import PopulationPolicy
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
@@ -77,10 +78,11 @@ class Population(ResumableAlgorithm, PopulationMembers):
         self.cuda_graphs = self.agents[0].get("cuda_graphs", True)
         self._failures: list[str | None] = [None] * len(self.agents)
         self._agent_updates = np.zeros(len(self.agents), dtype=np.int64)
+        self._policies_trained, self._policies_due = (np.zeros(len(self.agents), dtype=bool) for _ in range(2))
         first = self.agents[0]
         super().__init__(
             policy,
-            make_vec_env(env, n_envs=len(self.agents)) if isinstance(env, str) else env,  # type: ignore[arg-type]
+            make_agents_env(env, len(self.agents)),
             first.get("learning_rate", 1e-3),
             policy_kwargs=first.get("policy_kwargs"),
             replay_buffer_kwargs=first.get("replay_buffer_kwargs"),
@@ -169,7 +171,8 @@ class Population(ResumableAlgorithm, PopulationMembers):
         progress_bar: bool = False,
     ) -> SelfPopulation:
         """
-        Learn as SB3's algorithms do. With offline training, train the agents' policies at the end, one after another.
+        Learn as SB3's algorithms do. With offline training, train the actors at the end, one after another: those of the
+        agents whose critics have learnt.
 
         :param total_timesteps: number of steps of all environments together
         :param callback: callback(s) called at every step with state of the algorithm.
@@ -183,8 +186,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         self._report_failures()
         # A loaded population has no transitions if a callback stopped `learn` at its first step
-        has_data = self.replay_buffer is not None and self.replay_buffer.size() > 0 and self._agent_updates.any()
-        if self._policy_loss is not None and not self._trains_online and has_data:
+        if self.replay_buffer is not None and self.replay_buffer.size() > 0:
             self._train_policies()
         return self
 
@@ -192,7 +194,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
     def load(
         cls: type[SelfPopulation],
         path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         *args: Any,
         **kwargs: Any,
     ) -> SelfPopulation:
@@ -200,7 +202,8 @@ class Population(ResumableAlgorithm, PopulationMembers):
         Load a population from a zip-file, as SB3 does, without a replay buffer until ``learn`` allocates it.
 
         :param path: path to the file (or a file-like)
-        :param env: the environments, one for each agent; None for predictions alone
+        :param env: the environments, one for each agent, or the name of an environment, which is made once for each agent;
+            None for predictions alone
         :param args: the further parameters of SB3's ``load``
         :param kwargs: the same by keyword
         :return: the population
@@ -209,7 +212,22 @@ class Population(ResumableAlgorithm, PopulationMembers):
         """
         for name in {"agents", *OWN, *COMMON} & kwargs.keys():
             require(name in ("verbose", "tensorboard_log"), name, kwargs[name], "left out: change it in a new population")
-        return super().load(path, env, *args, **kwargs)
+        path = cls._file_of(path, "zip")
+        return super().load(path, cls._make_env(env, path), *args, **kwargs)
+
+    @classmethod
+    def _make_env(cls, env: Any, saved: Any) -> Any:
+        # A population has as many environments as agents. A file without the number is refused when it is loaded.
+        return make_agents_env(env, saved_attributes(saved).get("n_envs", 1)) if isinstance(env, str) else env
+
+    def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
+        """
+        Set the environments of the agents, see SB3's method.
+
+        :param env: the environments, one for each agent, or the name of an environment, which is made once for each agent
+        :param force_reset: see SB3's method
+        """
+        super().set_env(make_agents_env(env, len(self)), force_reset)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_schedules", "_numbers", "_counts", "_recorded", "_unlogged"]

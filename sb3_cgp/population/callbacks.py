@@ -84,6 +84,10 @@ class PopulationEvalCallback(EventCallback):
         self.evaluations_results: list[np.ndarray] = []
         self.evaluations_length: list[np.ndarray] = []
 
+    def _init_callback(self) -> None:
+        allowed = "a Population, whose agents PopulationEvalCallback evaluates: use SB3's EvalCallback for a single agent"
+        require(isinstance(self.model, Population), "model", type(self.model).__name__, allowed)
+
     @property
     def mean_rewards(self) -> np.ndarray:
         """The agents' mean returns at each evaluation, (T, N)."""

@@ -58,3 +58,14 @@ def make_population_env(
         chunks = {"n_processes": n_processes, "start_method": start_method}
         in_processes = {"vec_env_cls": ChunkedSubprocVecEnv, "vec_env_kwargs": chunks}
     return make_vec_env(env_id, n_agents, seed, wrapper_class=wrap, **in_processes, **kwargs)
+
+
+def make_agents_env(env: Any, n_agents: int) -> Any:
+    """
+    Make the environments of a population if the name of an environment is given, as its constructor does.
+
+    :param env: the name of an environment, or the environments
+    :param n_agents: number of environments, one for each agent
+    :return: the environments
+    """
+    return make_vec_env(env, n_agents) if isinstance(env, str) else env

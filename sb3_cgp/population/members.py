@@ -1,7 +1,10 @@
 """The agents of a population as ordinary CGPs."""
 
 from collections.abc import Iterator
+from typing import Any
 
+import numpy as np
+import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_cgp.algorithm import CGP
@@ -14,14 +17,25 @@ from sb3_cgp.population.replay import copied_column
 class PopulationMembers(OverlappedTraining):
     """The part of :class:`~sb3_cgp.population.algorithm.Population` that copies its agents into CGPs, and back."""
 
-    # Whether the actors have been trained offline
-    _policy_is_trained: bool = False
-
     def _choose_inference(self) -> None:
-        """Let ``predict`` use the network that the user chose, or the selector while no actor is trained."""
-        has_actor = self._trains_online or (self._policy_loss is not None and self._policy_is_trained)
-        self.policy.inference = (self.agents[0].get("inference") or "actor") if has_actor else "cem"
-        self.policy.actor_proposes = has_actor
+        """Let ``predict`` use the network that the user chose, or the selector for agents whose actor is not trained."""
+        has_actor = self._policies_trained | self._trains_online
+        self.policy.inference = (self.agents[0].get("inference") or "actor") if has_actor.any() else "cem"
+        self.policy.set_actors(has_actor)
+
+    def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto") -> None:
+        """
+        Load parameters, see SB3's method. As in a CGP alone, the loaded actors of agents that have not learnt yet then act if
+        their optimizers' states show that they have been trained.
+
+        :param load_path_or_dict: path to the file, an open file, or the parameters by module
+        :param exact_match: whether the parameters of every module must be given
+        :param device: the device on which the parameters are loaded
+        """
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        steps = self.policy.actor_optimizer.steps.flatten().numpy(force=True)
+        self._policies_trained |= (steps > 0) & (self._agent_updates == 0) & self._trains_offline
+        self._choose_inference()
 
     def __len__(self) -> int:
         return len(self.agents)
@@ -66,14 +80,14 @@ class PopulationMembers(OverlappedTraining):
         agent._n_updates = int(self._agent_updates[index])
         agent._current_progress_remaining = self._current_progress_remaining
         is_online = self._trains_online and agent._n_updates >= agent.policy_delay
-        agent._policy_is_trained = is_online or (self._policy_is_trained and index not in self.failed)
-        agent._policy_is_due = not self._trains_online and not self._policy_is_trained and agent._n_updates > 0
+        agent._policy_is_trained = is_online or bool(self._policies_trained[index])
+        agent._policy_is_due = bool(self._policies_due[index])
         agent._choose_inference()
         return agent
 
     def _train_policies(self) -> None:
-        """Train the actors offline, each by its own CGP."""
-        for index in sorted(set(range(len(self))) - set(self.failed)):
+        """Train the actors that are due offline, each by its own CGP."""
+        for index in sorted(set(np.flatnonzero(self._policies_due).tolist()) - set(self.failed)):
             agent = self._make_agent(index)
             assert self.replay_buffer is not None
             agent.replay_buffer = copied_column(self.replay_buffer, index)
@@ -83,5 +97,6 @@ class PopulationMembers(OverlappedTraining):
             except ValueError as error:
                 # Of a loss that is NaN or infinite
                 self._note_failure(index, str(error))
-        self._policy_is_trained = True
-        self._choose_inference()
+                continue
+            self._policies_trained[index], self._policies_due[index] = True, False
+            self._choose_inference()

@@ -82,6 +82,12 @@ class OverlappedTraining(PopulationTraining):
         finally:
             self.num_timesteps = n_before
 
+    def __getstate__(self) -> dict[str, Any]:
+        # SB3's wrappers can be neither copied nor pickled. The next rollout makes a new one.
+        inherited = getattr(super(), "__getstate__", None)
+        state = vars(self) if inherited is None else inherited()
+        return {name: value for name, value in state.items() if name != "_overlapping_env"}
+
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_overlapping_env"]
 

@@ -5,13 +5,14 @@ Shapes: N agents, B states per agent, F features, A action dimensions.
 """
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
@@ -42,6 +43,7 @@ class PopulationPolicy(BasePolicy):
     actor_optimizer: AgentAdam
     critic_optimizer: AgentAdam
     failed_at: th.Tensor
+    _has_actor: th.Tensor
     # Carries a selection of actions out, as a CUDA graph while a population is trained; None for an ordinary call
     recorded_selection: Callable[[Selection, th.Tensor], th.Tensor] | None = None
 
@@ -52,7 +54,6 @@ class PopulationPolicy(BasePolicy):
         self.n_agents = len(agents)
         self.selector = first.policy.selector
         self.inference = first.policy.inference
-        self.actor_proposes = getattr(first.policy, "actor_proposes", False)
         self.actors = StackedMLP([[agent.actor.mu] for agent in agents])
         self.critics = StackedMLP([agent.critic.q_networks for agent in agents])
         self.averaged_actors = StackedMLP([[agent.actor_target.mu] for agent in agents])
@@ -63,6 +64,18 @@ class PopulationPolicy(BasePolicy):
         self.critic_optimizer = AgentAdam.like(first.critic.optimizer, self.critics.ordered())
         # The agent's gradient step whose loss was NaN or infinite, of the critic and of the actor; -1 for none
         self.register_buffer("failed_at", th.full((2, self.n_agents), -1, dtype=th.long))
+        # Not saved, as the population sets it when it is loaded. On the device, for CUDA graphs.
+        self.register_buffer("_has_actor", th.ones(self.n_agents, dtype=th.bool), persistent=False)
+        self.set_actors([True] * self.n_agents)
+
+    def set_actors(self, has_actor: Iterable[bool]) -> None:
+        """
+        Set which agents have a trained actor: it acts and proposes for these agents alone, the selector acts for the others.
+
+        :param has_actor: whether each agent has one
+        """
+        self.has_actor = tuple(map(bool, has_actor))
+        self._has_actor.copy_(th.tensor(self.has_actor))
 
     def features(self, observations: th.Tensor) -> th.Tensor:
         """
@@ -99,13 +112,21 @@ class PopulationPolicy(BasePolicy):
         :return: the actions, (N, B, A), in the scaled action space
         """
         critics, actors = (self.target_critics, self.averaged_actors) if by_targets else (self.critics, self.actors)
-        arguments = {}
-        if self.actor_proposes and takes_proposals(self.selector):
-            arguments["proposals"] = actors(features)[0].flatten(0, 1).unsqueeze(1)
-        assert isinstance(self.action_space, spaces.Box) and self.selector is not None  # noqa: PT018
-        n_rows, action_dim = features.shape[0] * features.shape[1], int(self.action_space.shape[0])
+        if not takes_proposals(self.selector) or not any(self.has_actor):
+            return self._select(critics, features)
+        proposing = self._select(critics, features, proposals=actors(features)[0].flatten(0, 1).unsqueeze(1))
+        return proposing if all(self.has_actor) else self._where_actor(proposing, self._select(critics, features))
+
+    def _select(self, critics: StackedMLP, features: th.Tensor, **arguments: th.Tensor) -> th.Tensor:
+        """Select each state's action, (N, B, A), by the values of some critics."""
+        assert self.selector is not None
+        n_rows, action_dim = features.shape[0] * features.shape[1], get_action_dim(self.action_space)
         selection = self.selector.select(critics.score(features), n_rows, action_dim, features.device, **arguments)
         return selection.actions.unflatten(0, features.shape[:2])
+
+    def _where_actor(self, actions: th.Tensor, others: th.Tensor) -> th.Tensor:
+        """Return the actions of the agents that have a trained actor, and other actions of the others, (N, ..., A)."""
+        return th.where(self._has_actor.view(-1, *[1] * (actions.dim() - 1)), actions, others)
 
     def set_training_mode(self, mode: bool) -> None:
         """
@@ -124,12 +145,12 @@ class PopulationPolicy(BasePolicy):
         require(n_rows == self.n_agents, "observation", f"{n_rows} rows", allowed)
         if self.inference == "cem":
             recorded = self.recorded_selection
-            return self._select(observation) if recorded is None else recorded(self._select, observation)
+            return self._act_by_selector(observation) if recorded is None else recorded(self._act_by_selector, observation)
         actors = self.averaged_actors if self.inference == "averaged_actor" else self.actors
         actions: th.Tensor = actors(self.features(observation.unsqueeze(1)))[0].squeeze(1)
-        return actions
+        return actions if all(self.has_actor) else self._where_actor(actions, self._act_by_selector(observation))
 
-    def _select(self, observation: th.Tensor) -> th.Tensor:
+    def _act_by_selector(self, observation: th.Tensor) -> th.Tensor:
         """Select each agent's action, (N, A), at its observation."""
         return self.select_actions(self.features(observation.unsqueeze(1))).squeeze(1)
 
@@ -173,7 +194,7 @@ class PopulationPolicy(BasePolicy):
     @th.no_grad()
     def copy_actor_from(self, agent: CGP, index: int) -> None:
         """
-        Copy the actor and its average of an ordinary CGP, which has trained them alone.
+        Copy the actor, its average and its optimizer's state of an ordinary CGP, which has trained the actor alone.
 
         :param agent: the CGP
         :param index: the agent's index
@@ -181,3 +202,12 @@ class PopulationPolicy(BasePolicy):
         for networks, network in ((self.actors, agent.actor), (self.averaged_actors, agent.actor_target)):
             for parameter, value in zip(network.parameters(), agent_slices(networks.ordered(), index), strict=True):
                 value.copy_(parameter.view_as(value))
+        optimizer = agent.actor.optimizer
+        if not optimizer.state:
+            return
+        parameters = optimizer.param_groups[0]["params"]
+        self.actor_optimizer.steps[index] = optimizer.state[parameters[0]]["step"]
+        for name in ("exp_avg", "exp_avg_sq"):
+            moments = agent_slices(self.actor_optimizer.moments(name), index)
+            for parameter, value in zip(parameters, moments, strict=True):
+                value.copy_(optimizer.state[parameter][name].view_as(value))

@@ -59,6 +59,9 @@ class PopulationTraining(
     _failures: list[str | None]
     # Gradient steps of each agent
     _agent_updates: np.ndarray
+    # Whether each agent's actor has been trained offline, and whether its critics have learnt since then
+    _policies_trained: np.ndarray
+    _policies_due: np.ndarray
     # The critics' and the actors' learning rates of each agent
     _schedules: list[tuple[Schedule, Schedule]]
     _numbers: AgentNumbers
@@ -76,6 +79,10 @@ class PopulationTraining(
     @property
     def _trains_online(self) -> bool:
         return self._policy_loss is not None and self.agents[0].get("policy_training", "online") == "online"
+
+    @property
+    def _trains_offline(self) -> bool:
+        return self._policy_loss is not None and not self._trains_online
 
     @property
     def failed(self) -> dict[int, str]:
@@ -123,6 +130,7 @@ class PopulationTraining(
         self._update_learning_rates()
         learns = self.num_timesteps // self.n_envs > self._counts["learning_starts"]
         learns &= np.array([failure is None for failure in self._failures])
+        self._policies_due |= learns & self._trains_offline
         n_updates_before = self._n_updates
         for _ in range(gradient_steps):
             self._n_updates += 1
@@ -173,7 +181,7 @@ class PopulationTraining(
         self, due: tuple[bool, bool] | None, list_state: Callable[[], Sequence[th.Tensor]]
     ) -> RecordedFunction:
         """Return the recorded function of a gradient step, or of acting, None; a new one for another selector."""
-        fixed = (due, repr(self.policy.selector), self.policy.actor_proposes)
+        fixed = (due, repr(self.policy.selector), self.policy.has_actor)
         if fixed not in self._recorded:
             self._recorded[fixed] = RecordedFunction(list_state)
         return self._recorded[fixed]

@@ -95,7 +95,7 @@ class ResumableAlgorithm(ResumableModel):
         elif store.folder.is_file() or Path(f"{store.folder}.zip").is_file():
             raise FileNotFoundError(f"There is no training state in {store.folder}: `load` reads a model that `save` wrote")
         try:
-            model = cls._load_state(store, maybe_make_env(env, 0), device, **kwargs)
+            model = cls._load_state(store, env, device, **kwargs)
         except BaseException:
             lock.release()
             raise
@@ -106,7 +106,7 @@ class ResumableAlgorithm(ResumableModel):
 
     @classmethod
     def _load_state(
-        cls: type[SelfResumableAlgorithm], store: StateStore, env: GymEnv | None, device: th.device | str, **kwargs: Any
+        cls: type[SelfResumableAlgorithm], store: StateStore, env: GymEnv | str, device: th.device | str, **kwargs: Any
     ) -> SelfResumableAlgorithm:
         """Load the newest undamaged state of a locked folder."""
         digests = store.digests()
@@ -119,7 +119,7 @@ class ResumableAlgorithm(ResumableModel):
                 " Leave it out: a resumed training restores the environment's state. `load` takes it, for a new episode."
             )
         check_load_arguments(cls, saved, kwargs, "resume")
-        model = cls.load(saved, env, device, force_reset=False, **kwargs)
+        model = cls.load(saved, cls._make_env(env, saved), device, force_reset=False, **kwargs)
         assert model.env is not None
         check_fits(model, state)
         # Model and environment must share the space, as wrappers may draw random actions from it, too
@@ -132,6 +132,11 @@ class ResumableAlgorithm(ResumableModel):
         }
         model.saved_to = {store.folder: digests}
         return model
+
+    @classmethod
+    def _make_env(cls, env: GymEnv | str, saved: Any) -> GymEnv:
+        """Make the environment of a saved model if its name is given. Subclasses that need several of them override this."""
+        return maybe_make_env(env, 0)
 
     def save(
         self,
