@@ -119,6 +119,33 @@ def test_later_settings_go_before_earlier_ones(tmp_path, sweep_of):
     assert sweep.runs()[0].key == "TD3,batch_size=8,Pendulum-v1,seed=0"
 
 
+@pytest.mark.parametrize(
+    ("axis", "is_replaced"),
+    [
+        ({"values": [0.5, 0.9]}, True),
+        ({"values": [0.5], "sets": {"gamma": "$value"}}, True),
+        ({"values": {"low": {"gamma": 0.5}, "high": {"gamma": 0.9}}}, True),
+        ({"values": {"low": {"gamma": 0.5}, "none": {}}}, False),
+        ({"values": [0.5], "sets_for": {"TD3": {}}}, False),
+    ],
+)
+@pytest.mark.parametrize("by_file", [False, True])
+def test_a_hyperparameter_that_axes_replace_in_every_run_is_named(tmp_path, sweep_of, capsys, axis, is_replaced, by_file):
+    sweep_of(axes={"gamma": axis}, hyperparams={"gamma": 0.7} if by_file else None)
+    capsys.readouterr()
+    sweep = load_sweep(str(tmp_path / "mine.yml"), {"hyperparams": {"tau": 0.1} | ({} if by_file else {"gamma": 0.7})})
+    warned = capsys.readouterr().err
+    assert ("gamma has no effect, as the axis 'gamma' sets it in every run" in warned) is is_replaced
+    assert ("gamma" in sweep.changes[0]) is (not by_file and not is_replaced)
+    assert "tau" in sweep.changes[0]
+
+
+def test_the_text_of_changes_has_no_tasks_seeds_and_methods():
+    sweep = load_sweep("e3", {"tasks": ["Pendulum-v1"], "seeds": 1, "steps": 400, "evaluation_interval": 20}, ["CGP-Online"])
+    assert sweep.changes == ["steps 400", "evaluation_interval 20"]
+    assert load_sweep("e5", {"hyperparams": {"policy_kwargs": "dict(net_arch=[64, 64])"}}).changes == []
+
+
 def test_the_documented_sweep_is_one(tmp_path):
     documentation = (Path(__file__).parent.parent / "docs" / "experiments.md").read_text()
     (example,) = re.findall(r"```yaml\n(.*?)```", documentation, flags=re.DOTALL)
@@ -193,7 +220,10 @@ def test_a_subset_of_seeds_and_a_checkpoint_interval(sweep_of):
             "axes.gamma",
             "only $value stands for something",
         ),
-        (dict(seeds=[1, 1]), "seeds", "must differ"),
+        (dict(seeds=[1, 1]), "mine.yml: seeds: ", "must differ"),
+        (dict(axes={"method": {"values": [1], "sets": {}}}), "method", "choose another name"),
+        (dict(axes={"task": {"values": [1], "sets": {}}}), "task", "choose another name"),
+        (dict(axes={"seed": {"values": [1], "sets": {}}}), "seed", "choose another name"),
         (dict(tasks=["Pendulum-v1"] * 2), "tasks", "must differ"),
         (dict(evaluation_interval=101), "evaluation_interval", "at most `steps`, 100"),
         (dict(hyperparams={"n_timesteps": 50}), "n_timesteps", "must be one of"),

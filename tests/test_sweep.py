@@ -235,6 +235,15 @@ def test_a_study_says_all_that_it_was_ever_given(tmp_path, ledger):
         ledger.open(shorter, describe(shorter, [], "cpu"))
 
 
+@pytest.mark.parametrize("options", [["--seeds", "2"], ["--methods", "SAC"], []])
+def test_a_repeated_command_leaves_the_settings_of_a_study(tmp_path, ledger, options):
+    before = ledger.description()["settings_in_words"]
+    again, _ = of_command_line(*SMALL, *options, "--results", str(tmp_path))
+    ledger.open(again, describe(again, ["again"], "cpu"))
+    assert ledger.description()["settings_in_words"] == before
+    assert not any(word in before for word in ("tasks", "seeds", "methods"))
+
+
 def test_runs_of_other_settings_are_not_adopted(tmp_path, ledger):
     folder = export_study("mine", f"sqlite:///{tmp_path}/studies.db", tmp_path / "results")
     for option, key in ((["--steps", "401"], "steps"), (["--set", "gamma=0.5"], "configurations")):

@@ -6,8 +6,9 @@ A file's keys are the fields of :class:`~benchmark.sweeps.sweep_files.SweepFile`
 
 import functools
 import itertools
+import sys
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,9 @@ from benchmark.sweeps.runs import Run, checkpoint_interval
 from benchmark.sweeps.sweep_files import Hyperparams, Inclusion, Method, Packages, SweepFile
 from benchmark.sweeps.validation import SweepError, read_yaml, validated
 
+# Fields that the page takes from the runs: a later command may add some, and names its own alone
+RECOMPUTED = ("tasks", "seeds")
+
 
 @dataclass(frozen=True)
 class Sweep:
@@ -29,7 +33,7 @@ class Sweep:
     :param name: the sweep's name
     :param file: the content of the file, with the changes
     :param methods: the methods by name
-    :param changes: the changes, as text
+    :param changes: the changes that have an effect, as text, without tasks, seeds and methods, which are those of the runs
     :param path: the file; None for a sweep without one
     """
 
@@ -168,7 +172,7 @@ def load_sweep(name: str, overrides: dict[str, Any] | None = None, methods: Sequ
     if "steps" in overrides:
         overrides = overrides | {"evaluation_interval": overrides.get("evaluation_interval", max(overrides["steps"] // 20, 1))}
     changed = overrides.get("hyperparams", {})
-    changes = [f"{key} {value}" for key, value in overrides.items()]
+    described = {key: value for key, value in overrides.items() if key not in RECOMPUTED}
     if "hyperparams" in overrides:
         overrides = overrides | {"hyperparams": file.hyperparams | overrides["hyperparams"]}
     if overrides:
@@ -178,13 +182,33 @@ def load_sweep(name: str, overrides: dict[str, Any] | None = None, methods: Sequ
     for method in chosen:
         if method not in known:
             raise SweepError("the command line", "methods", f"{method!r} must be one of {', '.join(known)}")
-    if methods:
-        changes.append(f"methods {', '.join(chosen)}")
-    sweep = Sweep(path.stem, file, {method: known[method] for method in chosen}, changes, path)
+    sweep = Sweep(path.stem, file, {method: known[method] for method in chosen}, path=path)
+    replaced = _replaced_hyperparams(sweep)
+    for key, axes in replaced.items():
+        place = "--set" if key in changed else path
+        print(f"Warning: {place}: {key} has no effect, as {axes} sets it in every run. Remove it.", file=sys.stderr)
+    effective = {key: value for key, value in changed.items() if key not in replaced}
+    described = {key: effective if key == "hyperparams" else value for key, value in described.items()}
+    changes = [f"{key} {value}" for key, value in described.items() if key != "hyperparams" or value]
+    sweep = replace(sweep, changes=changes)
     for run in {run.configuration: run for run in sweep.runs()}.values():
         for key, problem in problems(run.method, run.algo, run.hyperparams):
             raise SweepError(_origin(sweep, path, run, key, changed), key, problem)
     return sweep
+
+
+def _replaced_hyperparams(sweep: Sweep) -> dict[str, str]:
+    """Return the hyperparameters for all methods that axes replace in every run, with the axes in words."""
+    file, runs = sweep.file, sweep.runs()
+    found = {}
+    for key in file.hyperparams if runs else ():
+        setting = [
+            [axis for axis, value in run.settings.items() if key in file.axes[axis].hyperparams(axis, value, run.method)]
+            for run in runs
+        ]
+        if all(setting):
+            found[key] = " or ".join(f"the axis {axis!r}" for axis in dict.fromkeys(itertools.chain(*setting)))
+    return found
 
 
 def _methods_file(path: Path) -> Path:

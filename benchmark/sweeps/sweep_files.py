@@ -20,6 +20,9 @@ Hyperparams = dict[str, Any]
 # The types of values that Optuna distinguishes
 Value = bool | int | float | str | None
 
+# The parameters and attributes of a run, which its axes must not replace
+RESERVED = ("method", "task", "seed")
+
 
 def _known_algorithm(name: str) -> str:
     register()
@@ -210,6 +213,10 @@ class SweepFile(Strict):
         if self.evaluation_interval > self.steps:
             raise ValueError(f"`evaluation_interval` is {self.evaluation_interval}, but must be at most `steps`, {self.steps}")
         for name, axis in self.axes.items():
+            if name in RESERVED:
+                raise ValueError(
+                    f"`axes` names {name!r}, but {', '.join(RESERVED)} are names of a run's own: choose another name"
+                )
             for method in axis.sets_for:
                 if method not in self.methods:
                     raise ValueError(f"`axes.{name}.sets_for` names {method!r}, but must name one of {list(self.methods)}")

@@ -76,7 +76,7 @@ def _telling(errors: Sequence[ErrorDetails]) -> Sequence[ErrorDetails]:
 
 def _location(error: ErrorDetails) -> list[str]:
     # The names of alternatives are pydantic's own
-    return [str(part) for part in error["loc"] if not str(part).startswith(("list[", "dict[", "constrained-"))]
+    return [str(part) for part in error["loc"] if not str(part).startswith(("list[", "dict[", "constrained-", "function-"))]
 
 
 def _problem(error: ErrorDetails, kind: type[Strict]) -> str:
