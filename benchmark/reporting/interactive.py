@@ -132,11 +132,11 @@ def _menu(buttons: list[dict[str, Any]], side: str) -> dict[str, Any]:
 
 def _vertical(study: Study, task: str) -> dict[str, Any]:
     """Return the range of the vertical axis, that of the pictures; a double click shows all."""
-    first = first_training_step(study)
+    first, shown = first_training_step(study), shown_methods(study, task)
     returns = [
         value
         for record in study.records
-        if record.task == task and record.method in shown_methods(study, task)
+        if record.task == task and record.method in shown
         for step, value in zip(record.timesteps, record.returns, strict=True)
         if step > first and np.isfinite(value)
     ]

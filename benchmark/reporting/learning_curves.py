@@ -76,7 +76,8 @@ def timed_runs(study: Study, task: str) -> tuple[list[Record], dict[str, float]]
     :return: the runs, and the minutes per step by method; of :func:`shown_methods`, without those of which no complete run has
         a time
     """
-    records = [record for record in study.records if record.task == task and record.method in shown_methods(study, task)]
+    shown = shown_methods(study, task)
+    records = [record for record in study.records if record.task == task and record.method in shown]
     measured = [record for record in records if record.processor_seconds is not None]
     minutes: dict[str, list[float]] = {}
     for record in measured:
@@ -131,9 +132,7 @@ def _figure(
             panel.fill_between(x, *interval, color=looks[method]["color"], **BAND)
     for panel in axes[:: 1 if is_alone else 3]:
         panel.set_ylabel("return")
-    trained = [line[:, grid > first_training_step(study)] for line in lines.values()]
-    if any(line.size for line in trained):
-        axes[0].set_ylim(learnt_range(np.concatenate([line.ravel() for line in trained])))
+    show_learnt_range(axes[0], study, grid, list(lines.values()))
     return figure, drawn
 
 
@@ -146,6 +145,20 @@ def first_training_step(study: Study) -> int:
     """
     configurations = study.facts.get("configurations", {}).values()
     return max((int(entry.get("learning_starts", 0)) for entry in configurations), default=0)
+
+
+def show_learnt_range(panel: Axes, study: Study, grid: np.ndarray, lines: Sequence[np.ndarray]) -> None:
+    """
+    Limit the vertical axis to the evaluations after the first training step, if there are any.
+
+    :param panel: the axes
+    :param study: the study
+    :param grid: environment steps of the evaluations (E)
+    :param lines: each method's returns, (runs, E)
+    """
+    trained = np.concatenate([line[:, grid > first_training_step(study)].ravel() for line in lines])
+    if trained.size:
+        panel.set_ylim(learnt_range(trained))
 
 
 def learnt_range(returns: np.ndarray, margin: float = 0.04) -> tuple[float, float]:

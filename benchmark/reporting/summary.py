@@ -10,7 +10,7 @@ from benchmark.common.canvas import BAND, draw_line, draw_seeds, legend, panels,
 from benchmark.common.style import styles
 from benchmark.reporting.drawing import differing_range
 from benchmark.reporting.estimates import REPETITIONS, bootstrap, cells_of, interquartile_mean, share_reaching
-from benchmark.reporting.learning_curves import first_training_step, learnt_range
+from benchmark.reporting.learning_curves import show_learnt_range
 from benchmark.reporting.scores import Study, curves, evaluation_grid, floors, score_table
 
 # Those of them that a study ran are drawn
@@ -56,7 +56,7 @@ def methods_of(study: Study, task: str) -> Sequence[str]:
 def _draw_learning(panel: Axes, study: Study, repetitions: int) -> None:
     task = next(iter(study.tasks), "")
     floor, grid = floors(study.records).get(task, 0.0), evaluation_grid(study.records, task)
-    trained = []
+    drawn = []
     for method, look in styles(methods_of(study, task)).items():
         runs = [record for record in study.records if (record.task, record.method) == (task, method)]
         lines = curves(runs, floor, grid)
@@ -66,10 +66,9 @@ def _draw_learning(panel: Axes, study: Study, repetitions: int) -> None:
         draw_line(panel, grid, middle, method if len(runs) >= planned else f"{method}, {len(runs)} of {planned} seeds", look)
         if interval is not None:
             panel.fill_between(grid, *interval, color=look["color"], **BAND)
-        trained.append(lines[:, grid > first_training_step(study)])
+        drawn.append(lines)
     panel.set(title=task, xlabel="environment steps", ylabel="return", xlim=(0, grid[-1]))
-    if any(line.size for line in trained):
-        panel.set_ylim(learnt_range(np.concatenate([line.ravel() for line in trained])))
+    show_learnt_range(panel, study, grid, drawn)
     panel.xaxis.set_major_formatter(EngFormatter(sep=""))
     panel.yaxis.set_major_formatter(EngFormatter(sep=""))
 
