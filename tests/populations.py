@@ -99,3 +99,12 @@ def assert_alike(agent, alone, **tolerance):
             for key, value in expected.items():
                 th.testing.assert_close(own[key], value, msg=key, check_dtype=False, **tolerance)
     assert agent._n_updates == alone._n_updates
+
+
+def saved_and_loaded(population, folder):
+    """Save a population of three and its transitions, and return what is loaded from the files."""
+    population.save(folder / "population")
+    population.save_replay_buffer(folder / "buffer")
+    loaded = Population.load(folder / "population", env=make_env())
+    loaded.load_replay_buffer(folder / "buffer")
+    return loaded

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch as th
-from populations import adam_state, assert_alike, make, make_env
+from populations import adam_state, assert_alike, make, make_env, saved_and_loaded
 from stable_baselines3.common.env_util import make_vec_env
 from trainings import Do
 
@@ -83,10 +83,7 @@ def test_an_agent_whose_critics_have_not_learnt_gets_no_actor():
 
 def test_agents_are_trained_again_only_after_their_critics_have_learnt(tmp_path):
     population = make_offline(LATE).learn(3 * 40)
-    population.save(tmp_path / "population")
-    population.save_replay_buffer(tmp_path / "buffer")
-    loaded = Population.load(tmp_path / "population", env=make_env())
-    loaded.load_replay_buffer(tmp_path / "buffer")
+    loaded = saved_and_loaded(population, tmp_path)
     before = copy_weights(population)
     for model in (population, loaded):
         assert [agent.policy.inference for agent in model] == ["actor", "cem", "actor"]

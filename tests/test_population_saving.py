@@ -5,7 +5,7 @@ import io
 import numpy as np
 import pytest
 import torch as th
-from populations import AGENTS, VARIANTS, assert_alike, make, make_env
+from populations import AGENTS, VARIANTS, assert_alike, make, make_env, saved_and_loaded
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
@@ -16,10 +16,7 @@ from sb3_cgp.population import Population
 
 def test_a_population_is_saved_and_loaded(tmp_path):
     population = make(AGENTS).learn(3 * 60)
-    population.save(tmp_path / "population")
-    population.save_replay_buffer(tmp_path / "buffer")
-    loaded = Population.load(tmp_path / "population", env=make_env())
-    loaded.load_replay_buffer(tmp_path / "buffer")
+    loaded = saved_and_loaded(population, tmp_path)
     observations = np.random.default_rng(0).normal(size=(3, 3))
     np.testing.assert_array_equal(loaded.predict(observations)[0], population.predict(observations)[0])
     for index, agent in enumerate(loaded):
