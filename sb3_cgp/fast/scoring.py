@@ -40,7 +40,7 @@ def raise_mmap_threshold() -> None:
     glibc returns freed blocks above a threshold to the system, so that the activations of each block of states come from
     fresh pages. The threshold rises to the size of the largest such block freed so far, up to 32 MiB (``man mallopt``).
     The block that is allocated and freed here is never written, so that it occupies no memory. It makes CEM faster in
-    bfloat16, and no difference in float32.
+    bfloat16, and makes no difference in float32.
     """
     th.empty(MMAP_THRESHOLD, dtype=th.uint8)
 
