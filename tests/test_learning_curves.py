@@ -83,11 +83,30 @@ def test_runs_without_a_time_are_left_out_with_a_note(tmp_path: Path) -> None:
     assert "Left out" not in minutes_caption(study(tmp_path, [timed("TD3", 0, 8.0)]), "Pendulum-v1")
 
 
-def test_runs_of_several_machines_are_marked(tmp_path: Path) -> None:
-    chosen = study(tmp_path, [timed("TD3", 0, 8.0)])
-    assert "machines" not in minutes_caption(chosen, "Pendulum-v1")
-    chosen.facts["commands"] = [{"machine": {"cpu": "AMD", "gpu": None}}, {"machine": {"cpu": "AMD", "gpu": "H100"}}]
-    assert minutes_caption(chosen, "Pendulum-v1").endswith("on different machines (AMD, H100), so their times differ.")
+@pytest.mark.parametrize(
+    ("machines", "named"),
+    [
+        ([("AMD", "AVX2", None)], None),
+        ([("AMD", "AVX2", None), ("AMD", "AVX2", None)], None),
+        ([("AMD", "AVX2", None), ("AMD", "AVX512", None)], "AMD (AVX2), AMD (AVX512)"),
+        ([("AMD", "AVX2", None), ("Intel", "AVX2", None)], "AMD (AVX2), Intel (AVX2)"),
+        ([("AMD", "AVX2", None), ("AMD", "AVX2", "H100")], "AMD (AVX2), H100"),
+        ([("AMD", "AVX2", "H100"), ("Intel", "AVX512", "H100")], None),
+    ],
+)
+def test_runs_of_several_machines_are_marked(
+    tmp_path: Path, machines: list[tuple[str, str, str | None]], named: str | None
+) -> None:
+    fields = ("cpu", "cpu_capability", "gpu")
+    commands = [{"machine": dict(zip(fields, machine, strict=True))} for machine in machines]
+    chosen = study(tmp_path, [timed("TD3", 0, 8.0)], commands=commands)
+    caption = minutes_caption(chosen, "Pendulum-v1")
+    _, by_minutes = figure(chosen, "Pendulum-v1", 20)["layout"]["updatemenus"][0]["buttons"]
+    assert ("machines" in by_minutes["args"][1]["xaxis.title.text"]) == (named is not None)
+    if named is None:
+        assert "machines" not in caption
+    else:
+        assert caption.endswith(f"on different machines ({named}), so their times differ.")
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -16,7 +16,7 @@ from benchmark.reporting.commands import FIGURES_ONLY, FOLDER, command_line, wit
 from benchmark.reporting.comparisons import experiments_section
 from benchmark.reporting.drawing import final_rewards, sensitivity, stability, values
 from benchmark.reporting.estimates import REPETITIONS
-from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, shown_methods, timed_runs
+from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, processors, shown_methods, timed_runs
 from benchmark.reporting.light import light_section
 from benchmark.reporting.literature import published
 from benchmark.reporting.overview import overview
@@ -201,15 +201,13 @@ def minutes_caption(study: Study, task: str) -> str:
     shown = shown_methods(study, task)
     ran = sum(record.task == task and record.method in shown for record in study.records)
     left_out = ran - len(timed_runs(study, task)[0])
-    machines = [command["machine"] for command in study.facts["commands"]]
-    processors = dict.fromkeys(str(machine["gpu"] or machine["cpu"]) for machine in machines)
     sentences = [MINUTES.format(task)]
     if any(record.task == task and record.population > 1 for record in study.records):
         sentences.append("The time of runs that were trained as one population is the process's, divided by their number.")
     if left_out:
         sentences.append(f"Left out: {left_out} run{'s' * (left_out > 1)} without a recorded time.")
-    if len(processors) > 1:
-        sentences.append(f"The runs were on different machines ({', '.join(processors)}), so their times differ.")
+    if len(used := processors(study)) > 1:
+        sentences.append(f"The runs were on different machines ({', '.join(used)}), so their times differ.")
     return " ".join(sentences)
 
 

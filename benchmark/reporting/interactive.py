@@ -8,7 +8,14 @@ import numpy as np
 from benchmark.common.records import Record
 from benchmark.common.style import styles
 from benchmark.reporting.estimates import REPETITIONS, bootstrap, interquartile_mean
-from benchmark.reporting.learning_curves import MOST, first_training_step, learnt_range, shown_methods, timed_runs
+from benchmark.reporting.learning_curves import (
+    MOST,
+    first_training_step,
+    learnt_range,
+    processors,
+    shown_methods,
+    timed_runs,
+)
 from benchmark.reporting.literature import published
 from benchmark.reporting.scores import Study, curves, evaluation_grid, floors
 
@@ -46,7 +53,8 @@ def figure(study: Study, task: str, repetitions: int = REPETITIONS) -> dict[str,
     data += [_literature(entry) for entry in published(task, study.facts["steps"])]
     buttons = [_button(data, "by steps", "x", STEPS)]
     if minutes_per_step:
-        buttons.append(_button(data, "by minutes", "minutes", MINUTES))
+        unit = MINUTES if len(processors(study)) < 2 else f"{MINUTES}, on different machines"
+        buttons.append(_button(data, "by minutes", "minutes", unit))
     seeds = [number for number, trace in enumerate(data) if trace["meta"]["kind"] == "seed"]
     thin = [
         {"label": label, "method": "restyle", "args": [{"opacity": opacity}, seeds]}

@@ -63,6 +63,18 @@ def curves_by_minutes(study: Study, task: str, repetitions: int = REPETITIONS) -
     return png(figure)
 
 
+def processors(study: Study) -> list[str]:
+    """
+    Return the processors on which a study was trained: times on different ones cannot be compared.
+
+    :param study: the study
+    :return: the GPU's name, or the CPU's with its instruction set, as CPUs of different generations can have one name
+    """
+    machines = [command["machine"] for command in study.facts["commands"]]
+    names = (machine["gpu"] or f"{machine['cpu']} ({machine['cpu_capability']})" for machine in machines)
+    return list(dict.fromkeys(names))
+
+
 def timed_runs(study: Study, task: str) -> tuple[list[Record], dict[str, float]]:
     """
     Return a task's runs that curves by minutes show, and how long each method trains.
