@@ -17,7 +17,7 @@ from benchmark.reporting import figures as command
 from benchmark.reporting import learning_curves
 from benchmark.reporting.figures import draw, figures, minutes_caption
 from benchmark.reporting.interactive import figure
-from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, timed_runs
+from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, times_of
 from benchmark.reporting.literature import literature_section, published
 from benchmark.reporting.scores import Study, read_study
 from benchmark.reporting.summary import summary
@@ -75,30 +75,30 @@ def test_runs_without_a_time_are_left_out_with_a_note(tmp_path: Path) -> None:
     hopeless = replace(record("DDPG", 0, None, returns=[10.0]), processor_seconds=1.0)
     records = [timed("TD3", 0, 8.0), timed("TD3", 1, None), timed("SAC", 0, None), failing, hopeless]
     chosen = study(tmp_path, records)
-    kept, paces = timed_runs(chosen, "Pendulum-v1")
+    times = times_of(chosen, "Pendulum-v1")
     # A failed run has the time of those that were complete
-    assert sorted((run.method, run.seed) for run in kept) == [("TD3", 0), ("TD3", 3)]
-    assert paces == {"TD3": pytest.approx(8 / 1_000)}
+    assert sorted((run.method, run.seed) for run in times.runs) == [("TD3", 0), ("TD3", 3)]
+    assert times.minutes_per_step == {"TD3": pytest.approx(8 / 1_000)}
     assert minutes_caption(chosen, "Pendulum-v1").endswith("Left out: 3 runs without a recorded time.")
     assert "Left out" not in minutes_caption(study(tmp_path, [timed("TD3", 0, 8.0)]), "Pendulum-v1")
 
 
+def command_on(cpu: str, capability: str = "AVX2", gpu: str | None = None) -> dict[str, object]:
+    return {"machine": {"cpu": cpu, "cpu_capability": capability, "gpu": gpu}}
+
+
 @pytest.mark.parametrize(
-    ("machines", "named"),
+    ("commands", "named"),
     [
-        ([("AMD", "AVX2", None)], None),
-        ([("AMD", "AVX2", None), ("AMD", "AVX2", None)], None),
-        ([("AMD", "AVX2", None), ("AMD", "AVX512", None)], "AMD (AVX2), AMD (AVX512)"),
-        ([("AMD", "AVX2", None), ("Intel", "AVX2", None)], "AMD (AVX2), Intel (AVX2)"),
-        ([("AMD", "AVX2", None), ("AMD", "AVX2", "H100")], "AMD (AVX2), H100"),
-        ([("AMD", "AVX2", "H100"), ("Intel", "AVX512", "H100")], None),
+        ([command_on("AMD")], None),
+        ([command_on("AMD"), command_on("AMD")], None),
+        ([command_on("AMD"), command_on("AMD", "AVX512")], "AMD (AVX2), AMD (AVX512)"),
+        ([command_on("Intel"), command_on("AMD")], "AMD (AVX2), Intel (AVX2)"),
+        ([command_on("AMD"), command_on("AMD", gpu="H100")], "AMD (AVX2), H100"),
+        ([command_on("AMD", gpu="H100"), command_on("Intel", gpu="H100")], None),
     ],
 )
-def test_runs_of_several_machines_are_marked(
-    tmp_path: Path, machines: list[tuple[str, str, str | None]], named: str | None
-) -> None:
-    fields = ("cpu", "cpu_capability", "gpu")
-    commands = [{"machine": dict(zip(fields, machine, strict=True))} for machine in machines]
+def test_runs_whose_processors_were_not_recorded(tmp_path: Path, commands: list[dict[str, object]], named: str | None) -> None:
     chosen = study(tmp_path, [timed("TD3", 0, 8.0)], commands=commands)
     caption = minutes_caption(chosen, "Pendulum-v1")
     _, by_minutes = figure(chosen, "Pendulum-v1", 20)["layout"]["updatemenus"][0]["buttons"]
@@ -107,6 +107,49 @@ def test_runs_of_several_machines_are_marked(
         assert "machines" not in caption
     else:
         assert caption.endswith(f"on different machines ({named}), so their times differ.")
+
+
+# On the fast processor TD3 takes 2 minutes and SAC 3, on the slow one three times as long
+FAST, SLOW = ["fast"], ["slow"]
+
+
+@pytest.mark.parametrize(
+    ("processors", "minutes", "compared"),
+    [
+        # TD3's and SAC's runs, two each
+        ([FAST, FAST, FAST, FAST], (2.0, 3.0), []),
+        ([FAST, SLOW, FAST, FAST], (2.0, 3.0), ["fast"]),
+        ([SLOW, SLOW, SLOW, FAST], (6.0, 9.0), ["slow"]),
+        # As many on both: the first by name
+        ([FAST, SLOW, FAST, SLOW], (2.0, 3.0), ["fast"]),
+        # Continued on the other processor
+        ([[*FAST, *SLOW], FAST, FAST, SLOW], (2.0, 3.0), ["fast"]),
+        # No processor trained both methods
+        ([FAST, FAST, SLOW, SLOW], (2.0, 9.0), ["fast", "slow"]),
+        ([FAST, FAST, [*FAST, *SLOW], SLOW], (2.0, 9.0), ["fast", "slow"]),
+    ],
+)
+def test_times_are_compared_on_one_processor(
+    tmp_path: Path, processors: list[list[str]], minutes: tuple[float, float], compared: list[str]
+) -> None:
+    records = []
+    for index, names in enumerate(processors):
+        alone = 2.0 if index < 2 else 3.0
+        run = timed("TD3" if index < 2 else "SAC", index % 2, 3 * alone if "slow" in names else alone)
+        records.append(replace(run, processors=names))
+    chosen = study(tmp_path, records, seeds=[0, 1])
+    times = times_of(chosen, "Pendulum-v1")
+    assert [times.minutes_per_step[method] * 1_000 for method in ("TD3", "SAC")] == pytest.approx(minutes)
+    # The curves show all runs
+    assert times.runs == chosen.records
+    caption = minutes_caption(chosen, "Pendulum-v1")
+    if not compared:
+        assert "machines" not in caption
+    elif len(compared) == 1:
+        assert caption.endswith(f"on different machines (fast, slow); the times are those on {compared[0]}.")
+    else:
+        assert caption.endswith("on different machines (fast, slow), so their times differ.")
+    assert (len(times.processors) > 1) == (len(compared) > 1)
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -14,6 +14,7 @@ from optuna.storages import InMemoryStorage
 from studies import GRACE, Crew, assert_each_run_once, make_sweep, mortal, pretend_to_train, work_through
 
 import benchmark.worker
+from benchmark.common.provenance import machine, processor
 from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.studies import Ledger
@@ -101,5 +102,7 @@ def test_the_workers_command_trains_all_runs_of_a_study(tmp_path, monkeypatch):
     assert handled == [signal.SIGTERM, signal.SIGINT]
     assert_each_run_once(ledger.trials(), sweep)
     assert {trial.user_attrs[WORKER] for trial in ledger.trials()} == {f"{socket.gethostname()}:{os.getpid()}"}
+    here = processor(machine(th.device("cpu")))
+    assert all(record.processors == [here] for record in ledger.records())
     with pytest.raises(ValueError, match="must be more than two heartbeats"):
         benchmark.worker.main(["--study", "study", "--storage", url, "--logs", str(tmp_path), "--grace", "1"])

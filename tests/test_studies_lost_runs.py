@@ -6,7 +6,7 @@ from optuna.trial import TrialState
 from studies import GRACE
 
 from benchmark.sweeps.heartbeats import TrialLostError
-from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME
+from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME, PROCESSORS, SEED
 
 
 def test_a_silent_process_is_given_up_after_the_grace(ledger):
@@ -111,6 +111,27 @@ def test_a_run_that_is_given_back_is_taken_up_again(ledger):
     assert sorted(keys) == sorted({trial.user_attrs[KEY] for trial in ledger.trials()})
     assert ledger.left() == []
     assert {record.seed: record.seconds for record in ledger.records()} == {0: 12.0, 1: 5.0, 2: 5.0}
+
+
+@pytest.mark.parametrize(
+    ("attempts", "told"),
+    [([["a"]], ["a"]), ([["b"], ["a"]], ["a", "b"]), ([["a"], ["a"]], ["a"]), ([["a"], []], []), ([[], ["a"]], [])],
+)
+def test_a_run_names_the_processors_of_all_of_its_attempts(ledger, attempts, told):
+    for number, processors in enumerate(attempts):
+        claim = ledger.claim("one")
+        ledger.beat(claim, f"1-{number}", 10, 1.0)
+        if processors:
+            ledger.annotate(claim, PROCESSORS, processors)
+        if number < len(attempts) - 1:
+            ledger.release(claim)
+            # The other runs, which come first now
+            while (
+                other := ledger.claim("two", [trial for trial in ledger.trials() if trial.user_attrs[SEED] > 0])
+            ) is not None:
+                ledger.complete(other, 1.0)
+    ledger.complete(claim, 1.0)
+    assert {record.seed: record.processors for record in ledger.records()}[0] == told
 
 
 def test_a_run_between_two_trials_is_left(ledger):

@@ -1,12 +1,15 @@
 """The command that runs sweeps: its arguments, what it exports and adopts, and how far it says it is."""
 
 import json
+from dataclasses import replace
 
 import pytest
+import torch as th
 import yaml
 from optuna.trial import TrialState, create_trial
 
-from benchmark.common.records import Record, read_records, write_records
+from benchmark.common.provenance import machine, processor
+from benchmark.common.records import STUDY, Record, read_records, write_records
 from benchmark.sweep import hyperparameter, load, main, parse
 from benchmark.sweeps.checks import check_values
 from benchmark.sweeps.execution import describe
@@ -157,7 +160,10 @@ def end_both(ledger):
 def test_an_exported_study_is_adopted_by_another(tmp_path, ledger):
     end_both(ledger)
     folder = export_study("mine", f"sqlite:///{tmp_path}/studies.db", tmp_path / "results")
-    records = read_records(folder)
+    here = processor(machine(th.device("cpu")))
+    # Exported by an earlier version, which recorded the machines of the commands only
+    assert all(record.processors == [] for record in read_records(folder))
+    records = [replace(record, processors=[here]) for record in read_records(folder)]
     assert {record.error for record in records} == {None, "ValueError: a NaN"}
     (done,) = (record for record in records if record.error is None)
     assert (done.timesteps, done.returns, done.final, done.seconds) == ([20, 40], [-5.0, -4.0], -3.0, 12.0)
@@ -176,6 +182,13 @@ def test_an_exported_study_is_adopted_by_another(tmp_path, ledger):
     # Once
     other.open(sweep, description, ended)
     assert len(other.trials()) == 4
+    # Whatever trained them, of two machines
+    facts = json.loads((folder / STUDY).read_text())
+    elsewhere = {"machine": {"gpu": "H100"}, "command": "python -m benchmark.sweep mine", "runs_ended": 1}
+    (folder / STUDY).write_text(json.dumps(facts | {"commands": [*facts["commands"], elsewhere]}))
+    assert all(record.processors == [] for record in ended_runs(folder, description)[0])
+    write_records(folder, [replace(record, processors=["H100"]) for record in records])
+    assert all(record.processors == ["H100"] for record in ended_runs(folder, description)[0])
 
 
 def test_a_study_that_is_adopted_whole_still_says_what_trained_it(tmp_path, ledger):

@@ -80,6 +80,16 @@ def machine(device: th.device) -> dict[str, Any]:
     }
 
 
+def processor(hardware: dict[str, Any]) -> str:
+    """
+    Return the name of the processor that trains: times on different ones cannot be compared.
+
+    :param hardware: a description by :func:`machine`
+    :return: the GPU's name, or the CPU's with its instruction set, as CPUs of different generations can have one name
+    """
+    return hardware["gpu"] or f"{hardware['cpu']} ({hardware['cpu_capability']})"
+
+
 def commit() -> str | None:
     """
     Return the commit of the code.

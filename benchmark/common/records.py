@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,7 @@ class Record:
     :param processor_seconds: time on the processor of all attempts and threads together; None where it was not measured.
         Of a run in a population, the process's time divided by the number of agents
     :param population: number of agents that were trained in one process with it, itself included; 1 for a run alone
+    :param processors: the processor that trained it, several if it was continued on others; none where they were not recorded
     """
 
     experiment: str
@@ -74,6 +75,7 @@ class Record:
     seconds: float | None
     processor_seconds: float | None = None
     population: int = 1
+    processors: list[str] = field(default_factory=list)
 
     @property
     def key(self) -> str:

@@ -16,7 +16,7 @@ from benchmark.reporting.commands import FIGURES_ONLY, FOLDER, command_line, wit
 from benchmark.reporting.comparisons import experiments_section
 from benchmark.reporting.drawing import final_rewards, sensitivity, stability, values
 from benchmark.reporting.estimates import REPETITIONS
-from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, processors, shown_methods, timed_runs
+from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, shown_methods, times_of
 from benchmark.reporting.light import light_section
 from benchmark.reporting.literature import published
 from benchmark.reporting.overview import overview
@@ -173,7 +173,7 @@ def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
             drawn = curves_by_steps(study, task, repetitions)
             caption = CURVES.format(task) + LITERATURE * bool(published(task, study.facts["steps"]))
             pictures.append(picture("learning_curves", caption, drawn, task))
-            if timed_runs(study, task)[0]:
+            if times_of(study, task).runs:
                 drawn = curves_by_minutes(study, task, repetitions)
                 pictures.append(picture("learning_curves_by_minutes", minutes_caption(study, task), drawn, task))
         final = "Final rewards: interquartile mean, its 95 % interval, and every run as a stroke."
@@ -200,14 +200,17 @@ def minutes_caption(study: Study, task: str) -> str:
     """
     shown = shown_methods(study, task)
     ran = sum(record.task == task and record.method in shown for record in study.records)
-    left_out = ran - len(timed_runs(study, task)[0])
+    times = times_of(study, task)
+    left_out = ran - len(times.runs)
     sentences = [MINUTES.format(task)]
     if any(record.task == task and record.population > 1 for record in study.records):
         sentences.append("The time of runs that were trained as one population is the process's, divided by their number.")
     if left_out:
         sentences.append(f"Left out: {left_out} run{'s' * (left_out > 1)} without a recorded time.")
-    if len(used := processors(study)) > 1:
-        sentences.append(f"The runs were on different machines ({', '.join(used)}), so their times differ.")
+    if len(times.all_processors) > 1:
+        is_one = len(times.processors) == 1
+        consequence = f"; the times are those on {times.processors[0]}" if is_one else ", so their times differ"
+        sentences.append(f"The runs were on different machines ({', '.join(times.all_processors)}){consequence}.")
     return " ".join(sentences)
 
 

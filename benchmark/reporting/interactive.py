@@ -8,14 +8,7 @@ import numpy as np
 from benchmark.common.records import Record
 from benchmark.common.style import styles
 from benchmark.reporting.estimates import REPETITIONS, bootstrap, interquartile_mean
-from benchmark.reporting.learning_curves import (
-    MOST,
-    first_training_step,
-    learnt_range,
-    processors,
-    shown_methods,
-    timed_runs,
-)
+from benchmark.reporting.learning_curves import MOST, first_training_step, learnt_range, shown_methods, times_of
 from benchmark.reporting.literature import published
 from benchmark.reporting.scores import Study, curves, evaluation_grid, floors
 
@@ -39,21 +32,20 @@ def figure(study: Study, task: str, repetitions: int = REPETITIONS) -> dict[str,
     :param repetitions: number of bootstrap samples
     :return: ``data`` and ``layout`` of plotly.js
     """
-    timed, minutes_per_step = timed_runs(study, task)
-    keys = {record.key for record in timed}
+    times = times_of(study, task)
+    keys = {record.key for record in times.runs}
     data: list[Trace] = []
     methods = shown_methods(study, task)
     first = [method for method in FIRST if method in methods] or methods[:MOST]
     for method in methods:
         runs = [record for record in study.records if (record.task, record.method) == (task, method)]
         visible = True if len(methods) <= MOST or method in first else "legendonly"
-        data += [
-            trace | {"visible": visible} for trace in _method(study, runs, minutes_per_step.get(method), keys, repetitions)
-        ]
+        traces = _method(study, runs, times.minutes_per_step.get(method), keys, repetitions)
+        data += [trace | {"visible": visible} for trace in traces]
     data += [_literature(entry) for entry in published(task, study.facts["steps"])]
     buttons = [_button(data, "by steps", "x", STEPS)]
-    if minutes_per_step:
-        unit = MINUTES if len(processors(study)) < 2 else f"{MINUTES}, on different machines"
+    if times.runs:
+        unit = MINUTES if len(times.processors) < 2 else f"{MINUTES}, on different machines"
         buttons.append(_button(data, "by minutes", "minutes", unit))
     seeds = [number for number, trace in enumerate(data) if trace["meta"]["kind"] == "seed"]
     thin = [

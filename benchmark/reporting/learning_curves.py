@@ -1,6 +1,7 @@
 """Learning curves: by environment steps, beside published returns, and by minutes of processor time."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmark.common.canvas import BAND, count_steps, draw_line, draw_seeds, label_below, legend, panels, png, styled
+from benchmark.common.provenance import processor
 from benchmark.common.records import Record
 from benchmark.common.style import styles
 from benchmark.reporting.comparisons import RANDOM
@@ -52,51 +54,77 @@ def curves_by_minutes(study: Study, task: str, repetitions: int = REPETITIONS) -
     Draw a task's learning curves by processor time: the same, without runs that have no time.
 
     :param study: the study
-    :param task: the task, of which :func:`timed_runs` finds runs
+    :param task: the task, of which :func:`times_of` finds runs
     :param repetitions: number of bootstrap samples
     :return: the picture, as PNG
     """
-    records, minutes_per_step = timed_runs(study, task)
-    figure, drawn = _figure(study, task, records, minutes_per_step, repetitions)
+    times = times_of(study, task)
+    figure, drawn = _figure(study, task, times.runs, times.minutes_per_step, repetitions)
     label_below(list(drawn.values()), "minutes of processor time")
     legend(figure, list(drawn.values()), task)
     return png(figure)
 
 
-def processors(study: Study) -> list[str]:
+@dataclass(frozen=True)
+class Times:
     """
-    Return the processors on which a study was trained: times on different ones cannot be compared.
+    The times of a task's runs.
 
-    :param study: the study
-    :return: the GPU's name, or the CPU's with its instruction set, as CPUs of different generations can have one name
+    :param runs: the runs that curves by minutes show
+    :param minutes_per_step: by method
+    :param processors: the processors on which these minutes were measured
+    :param all_processors: those of all runs
     """
-    machines = [command["machine"] for command in study.facts["commands"]]
-    names = (machine["gpu"] or f"{machine['cpu']} ({machine['cpu_capability']})" for machine in machines)
-    return list(dict.fromkeys(names))
+
+    runs: list[Record]
+    minutes_per_step: dict[str, float]
+    processors: list[str]
+    all_processors: list[str]
 
 
-def timed_runs(study: Study, task: str) -> tuple[list[Record], dict[str, float]]:
+def times_of(study: Study, task: str) -> Times:
     """
     Return a task's runs that curves by minutes show, and how long each method trains.
 
     The time of a run is shared evenly among its steps, so that an evaluation takes place at ``processor_seconds`` times
-    its step, divided by the run's steps. An evaluation of a method stands at the mean of its runs' times. A failed run has
-    the time of the method's other runs, as the step at which it failed is not recorded.
+    its step, divided by the run's steps. An evaluation of a method stands at the mean of its runs' times: of those on the
+    processor that trained the most runs, among the processors that trained all methods, or of all runs if there is none. A
+    failed run has the time of the method's other runs, as the step at which it failed is not recorded.
 
     :param study: the study
     :param task: the task
-    :return: the runs, and the minutes per step by method; of :func:`shown_methods`, without those of which no complete run has
-        a time
+    :return: the times of :func:`shown_methods`, without those of which no complete run has a time
     """
     shown = shown_methods(study, task)
     records = [record for record in study.records if record.task == task and record.method in shown]
     measured = [record for record in records if record.processor_seconds is not None]
-    minutes: dict[str, list[float]] = {}
-    for record in measured:
-        if record.processor_seconds is not None and not failed(record):
-            minutes.setdefault(record.method, []).append(record.processor_seconds / 60 / record.steps)
-    paces = {method: float(np.mean(each)) for method, each in minutes.items()}
-    return [record for record in measured if record.method in paces], paces
+    compared = _on_one_processor(study, [record for record in measured if not failed(record)])
+    seconds: dict[str, list[float]] = {}
+    for record in compared:
+        seconds.setdefault(record.method, []).append((record.processor_seconds or 0.0) / record.steps)
+    paces = {method: float(np.mean(each)) / 60 for method, each in seconds.items()}
+    kept = [record for record in measured if record.method in paces]
+    return Times(kept, paces, _all_processors(study, compared), _all_processors(study, kept))
+
+
+def _on_one_processor(study: Study, runs: Sequence[Record]) -> Sequence[Record]:
+    """Return the runs on the processor that trained the most of them, if one trained all methods; otherwise all runs."""
+    by_processor: dict[str, list[Record]] = {}
+    for run in runs:
+        if len(names := _processors(study, run)) == 1:
+            by_processor.setdefault(names[0], []).append(run)
+    methods = {run.method for run in runs}
+    complete = [each for _, each in sorted(by_processor.items()) if {run.method for run in each} == methods]
+    return max(complete, key=len, default=runs)
+
+
+def _all_processors(study: Study, runs: Sequence[Record]) -> list[str]:
+    return sorted({name for run in runs for name in _processors(study, run)})
+
+
+def _processors(study: Study, run: Record) -> list[str]:
+    """Return the processors that may have trained a run: those of all commands for a run that does not have its own."""
+    return run.processors or [processor(command["machine"]) for command in study.facts["commands"]]
 
 
 def shown_methods(study: Study, task: str) -> list[str]:

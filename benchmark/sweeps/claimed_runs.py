@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Sequence
+from typing import Any
 
 from benchmark.sweeps.groups import DISSOLVED
 from benchmark.sweeps.heartbeats import TrialLostError
@@ -53,6 +54,18 @@ class ClaimedRuns:
         with self._lock:
             for claim in self._open.values():
                 self._ledger.beat(claim, count, step, seconds, processor_seconds / self._n_agents)
+
+    def annotate(self, name: str, value: Any) -> None:
+        """
+        Set an attribute of all open runs' trials.
+
+        :param name: the attribute
+        :param value: its value, as JSON has it
+        :raises TrialLostError: if another process has ended a trial
+        """
+        with self._lock:
+            for claim in self._open.values():
+                self._ledger.annotate(claim, name, value)
 
     def report(self, run: Run, step: int, value: float) -> None:
         """

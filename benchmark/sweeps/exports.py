@@ -2,12 +2,14 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from optuna.trial import TrialState
 
 from benchmark.common.files import write_json
+from benchmark.common.provenance import processor
 from benchmark.common.records import RUNS, STUDY, Record, read_records, write_records
 from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.study_trials import owned
@@ -90,4 +92,7 @@ def ended_runs(folder: Path, description: dict[str, Any]) -> tuple[list[Record],
             same = was[key] == now
         if not same:
             raise SweepError(folder / STUDY, key, "differs from the sweep's, so that its runs cannot be adopted")
-    return read_records(folder), was["commands"]
+    used = sorted({processor(command["machine"]) for command in was["commands"]})
+    # Earlier versions recorded the machines of the commands only
+    known = used if len(used) == 1 else []
+    return [replace(record, processors=record.processors or known) for record in read_records(folder)], was["commands"]

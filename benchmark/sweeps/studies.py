@@ -40,6 +40,7 @@ from benchmark.sweeps.study_trials import (
     KEY,
     OUTCOME,
     POPULATION,
+    PROCESSORS,
     RUN,
     SWEEP,
     WORKER,
@@ -172,12 +173,13 @@ class Ledger(TrialWriter):
             progress = {PROGRESS: {"step": record.steps, **spent}, OUTCOME: "adopted"}
             population = {} if record.population == 1 else {POPULATION: {"agents": record.population}}
             error = {} if record.error is None else {ERROR: record.error}
+            processors = {PROCESSORS: record.processors} if record.processors else {}
             trial = create_trial(
                 state=TrialState.FAIL if record.final is None else TrialState.COMPLETE,
                 value=record.final,
                 params=params_of(run, self._distributions),
                 distributions=self._distributions,
-                user_attrs=attributes_of(run) | progress | population | error,
+                user_attrs=attributes_of(run) | progress | population | error | processors,
                 intermediate_values=dict(zip(record.timesteps, record.returns, strict=True)),
             )
             patiently(self.storage.create_new_trial, self.study_id, trial)

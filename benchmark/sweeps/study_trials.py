@@ -16,6 +16,8 @@ from benchmark.sweeps.runs import Run
 SWEEP, COMMAND = "sweep", "command "
 # Attributes of a trial
 RUN, KEY, ERROR, WORKER, OUTCOME = "run", "key", "error", "worker", "outcome"
+# A list: the processor on which this trial was trained; of an adopted run, all that trained it
+PROCESSORS = "processors"
 # Of a run that is trained in a population: the number of its agents, and the name of the group of runs
 POPULATION = "population"
 # The seed is an attribute, for optuna-dashboard to show and sort by. As a parameter, it would take part in the importances of
@@ -80,6 +82,17 @@ def seconds_of(trials: Iterable[FrozenTrial], kind: str) -> float | None:
     """
     times = [trial.user_attrs[PROGRESS].get(kind) for trial in trials if PROGRESS in trial.user_attrs]
     return None if None in times else sum(times)
+
+
+def processors_of(trials: Iterable[FrozenTrial]) -> list[str]:
+    """
+    Return the processors on which a run was trained.
+
+    :param trials: all trials of the run
+    :return: their names; none if one of the trials has reported progress, but not its processor
+    """
+    named = [trial.user_attrs.get(PROCESSORS, []) for trial in trials if PROGRESS in trial.user_attrs]
+    return sorted({name for names in named for name in names}) if all(named) else []
 
 
 def params_of(run: Run, distributions: Mapping[str, BaseDistribution]) -> dict[str, Any]:
@@ -153,4 +166,5 @@ def record_of(experiment: str, trial: FrozenTrial, trials: Iterable[FrozenTrial]
         seconds_of(trials, "seconds"),
         seconds_of(trials, "processor_seconds"),
         trial.user_attrs.get(POPULATION, {}).get("agents", 1),
+        processors_of(trials),
     )

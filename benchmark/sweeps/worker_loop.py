@@ -9,7 +9,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from filelock import FileLock
+from stable_baselines3.common.utils import get_device
 
+from benchmark.common.provenance import machine, processor
 from benchmark.sweeps.claimed_runs import ClaimedRuns
 from benchmark.sweeps.groups import FOLDER, RUNS, Group, Groups
 from benchmark.sweeps.heartbeats import BEAT, HeartbeatThread, TrialLostError
@@ -18,7 +20,7 @@ from benchmark.sweeps.processes import PAUSE, TERMINATED
 from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, has_state, run_folder, train
 from benchmark.sweeps.runs import Run
 from benchmark.sweeps.studies import Ledger
-from benchmark.sweeps.study_trials import RUN, Claim, owned
+from benchmark.sweeps.study_trials import PROCESSORS, RUN, Claim, owned
 
 
 def execute_runs(
@@ -72,6 +74,7 @@ def _train_claimed(
     # The states are removed before the locks are released, as another process may then continue from them
     with ExitStack() as locks:
         try:
+            claimed.annotate(PROCESSORS, [processor(machine(get_device(device)))])
             with HeartbeatThread(claimed.beat, beat, parent) as heartbeat:
                 locks.enter_context(_locked(folders))
                 if group is None:
