@@ -109,6 +109,14 @@ def test_runs_whose_processors_were_not_recorded(tmp_path: Path, commands: list[
         assert caption.endswith(f"on different machines ({named}), so their times differ.")
 
 
+def test_runs_whose_processor_was_not_recorded_have_that_of_all_commands(tmp_path: Path) -> None:
+    """Two commands on one processor, by an earlier version and by this one."""
+    records = [timed("TD3", 0, 2.0), replace(timed("TD3", 1, 4.0), processors=["AMD (AVX2)"])]
+    chosen = study(tmp_path, records, commands=[command_on("AMD"), command_on("AMD")])
+    assert times_of(chosen, "Pendulum-v1").minutes_per_step == {"TD3": pytest.approx(3.0 / 1_000)}
+    assert "machines" not in minutes_caption(chosen, "Pendulum-v1")
+
+
 # On the fast processor TD3 takes 2 minutes and SAC 3, on the slow one three times as long
 FAST, SLOW = ["fast"], ["slow"]
 

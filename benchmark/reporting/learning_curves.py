@@ -124,7 +124,7 @@ def _all_processors(study: Study, runs: Sequence[Record]) -> list[str]:
 
 def _processors(study: Study, run: Record) -> list[str]:
     """Return the processors that may have trained a run: those of all commands for a run that does not have its own."""
-    return run.processors or [processor(command["machine"]) for command in study.facts["commands"]]
+    return run.processors or sorted({processor(command["machine"]) for command in study.facts["commands"]})
 
 
 def shown_methods(study: Study, task: str) -> list[str]:
