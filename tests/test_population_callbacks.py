@@ -17,6 +17,7 @@ def test_all_agents_are_evaluated_at_once(tmp_path):
     callback = PopulationEvalCallback(
         make_vec_env("Pendulum-v1", 2, seed=5), eval_freq=25, n_eval_episodes=2, log_path=str(tmp_path)
     )
+    assert callback.mean_rewards.shape == (0,)
     population = make(2, env="Pendulum-v1").learn(2 * 60, callback=callback)
     assert callback.mean_rewards.shape == (2, 2)
     with np.load(tmp_path / "evaluations.npz") as saved:

@@ -90,8 +90,8 @@ class PopulationEvalCallback(EventCallback):
 
     @property
     def mean_rewards(self) -> np.ndarray:
-        """The agents' mean returns at each evaluation, (T, N)."""
-        return np.array(self.evaluations_results).mean(axis=2)
+        """The agents' mean returns at each evaluation, (T, N); of shape (0,) before the first one."""
+        return np.array([np.mean(returns, axis=1) for returns in self.evaluations_results])
 
     def _on_step(self) -> bool:
         if self.n_calls % self.eval_freq != 0:
