@@ -90,6 +90,16 @@ def processor(hardware: dict[str, Any]) -> str:
     return hardware["gpu"] or f"{hardware['cpu']} ({hardware['cpu_capability']})"
 
 
+def processors_of_commands(commands: Sequence[dict[str, Any]]) -> list[str]:
+    """
+    List the processors on which commands trained.
+
+    :param commands: records with the field "machine" of :func:`conditions`
+    :return: their names by :func:`processor`, each once, in alphabetical order
+    """
+    return sorted({processor(command["machine"]) for command in commands})
+
+
 def commit() -> str | None:
     """
     Return the commit of the code.

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmark.common.canvas import BAND, count_steps, draw_line, draw_seeds, label_below, legend, panels, png, styled
-from benchmark.common.provenance import processor
+from benchmark.common.provenance import processors_of_commands
 from benchmark.common.records import Record
 from benchmark.common.style import styles
 from benchmark.reporting.comparisons import RANDOM
@@ -124,7 +124,7 @@ def _all_processors(study: Study, runs: Sequence[Record]) -> list[str]:
 
 def _processors(study: Study, run: Record) -> list[str]:
     """Return the processors that may have trained a run: those of all commands for a run that does not have its own."""
-    return run.processors or sorted({processor(command["machine"]) for command in study.facts["commands"]})
+    return run.processors or processors_of_commands(study.facts["commands"])
 
 
 def shown_methods(study: Study, task: str) -> list[str]:

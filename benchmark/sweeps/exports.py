@@ -9,7 +9,7 @@ from typing import Any
 from optuna.trial import TrialState
 
 from benchmark.common.files import write_json
-from benchmark.common.provenance import processor
+from benchmark.common.provenance import processors_of_commands
 from benchmark.common.records import RUNS, STUDY, Record, read_records, write_records
 from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.study_trials import owned
@@ -92,7 +92,7 @@ def ended_runs(folder: Path, description: dict[str, Any]) -> tuple[list[Record],
             same = was[key] == now
         if not same:
             raise SweepError(folder / STUDY, key, "differs from the sweep's, so that its runs cannot be adopted")
-    used = sorted({processor(command["machine"]) for command in was["commands"]})
+    used = processors_of_commands(was["commands"])
     # Earlier versions recorded the machines of the commands only
     known = used if len(used) == 1 else []
     return [replace(record, processors=record.processors or known) for record in read_records(folder)], was["commands"]
