@@ -30,7 +30,7 @@ def test_bare_products_do_the_operations_that_are_counted(monkeypatch, batch):
         assert weight.shape == (4, 4)
         counted.append(2 * left.shape[0] * left.shape[1] * weight.shape[0])
 
-    monkeypatch.setattr(products, "kernels", lambda device: {"kernel": multiply})
+    monkeypatch.setattr(products, "kernels", lambda device, dtype: {"kernel": multiply})
     ways = products.bare_products(sizes, th.bfloat16, CPU)
     assert len(ways) == (1 if batch == 100 else 4)
     for run in ways.values():
@@ -42,9 +42,17 @@ def test_bare_products_do_the_operations_that_are_counted(monkeypatch, batch):
 @pytest.mark.parametrize("dtype", [th.float32, th.bfloat16])
 def test_every_kernel_multiplies_by_the_transposed_weights(dtype):
     left, weight, result = th.randn(5, 8).to(dtype), th.randn(8, 8).to(dtype), th.empty(5, 8, dtype=dtype)
-    for name, multiply in products.kernels(CPU).items():
+    for name, multiply in products.kernels(CPU, dtype).items():
         product = multiply(left, weight, result)
         th.testing.assert_close(product.float(), left.float() @ weight.float().t(), rtol=1e-2, atol=1e-1, msg=name)
+
+
+def test_kernels_leave_out_those_that_the_processor_lacks_for_a_data_type(monkeypatch):
+    """As oneDNN's bfloat16, which needs AVX-512."""
+    monkeypatch.setattr(products, "onednn_linear", lambda dtype: th.mm if dtype == th.float32 else None)
+    assert set(products.kernels(CPU, th.float32)) == {"mm", "oneDNN"}
+    assert set(products.kernels(CPU, th.bfloat16)) == {"mm"}
+    assert set(products.kernels(th.device("cuda"), th.float32)) == {"mm"}
 
 
 def test_sizes_are_varied_one_at_a_time():
@@ -66,7 +74,7 @@ def test_selector_writes_what_follows_from_the_seconds(tmp_path):
     assert entry["ratio_to_plain"] == pytest.approx((call[0] / plain[0] + call[1] / plain[1]) / 2)
     assert entry["flops_per_second"] == pytest.approx(entry["call_flops"] / np.mean(call))
     medians = {way: product["median"] for way, product in entry["product_seconds"].items()}
-    assert len(medians) == 4 * len(products.kernels(CPU))
+    assert len(medians) == 4 * len(products.kernels(CPU, th.float32))
     floor = entry["fastest_product"]
     assert medians[floor] == min(medians.values())
     fastest = entry["product_seconds"][floor]["all"]

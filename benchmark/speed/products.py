@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import torch as th
 
+from sb3_cgp.fast.linear import onednn_linear
+
 # Rows of the blocks that are tried, besides all rows at once: on a CPU, a block that stays in cache is often faster
 BLOCK_ROWS = (256, 1024, 2048)
 # Multiplies (rows, H) by a linear layer's weights, (H, H), and may write to a given tensor
@@ -90,18 +92,18 @@ def outer_products(sizes: Sizes, device: th.device) -> Callable[[], object]:
     return run
 
 
-def kernels(device: th.device) -> dict[str, Kernel]:
+def kernels(device: th.device, dtype: th.dtype) -> dict[str, Kernel]:
     """
     Return the ways of multiplying to try: the fastest differs between processors.
 
     :param device: the device
+    :param dtype: the data type, which oneDNN may not support on this processor
     :return: the ways, by name
     """
     found: dict[str, Kernel] = {"mm": lambda left, weight, result: th.mm(left, weight.t(), out=result)}
-    # Private, as only PyTorch's compiler calls it; `mm` in float32 is MKL's, which has half its speed on AMD's processors
-    onednn_linear = getattr(th.ops.mkldnn, "_linear_pointwise", None)
-    if device.type == "cpu" and th.backends.mkldnn.is_available() and onednn_linear is not None:
-        found["oneDNN"] = lambda left, weight, result: onednn_linear(left, weight, None, "none", [], "")
+    linear = onednn_linear(dtype) if device.type == "cpu" else None
+    if linear is not None:
+        found["oneDNN"] = lambda left, weight, result: linear(left, weight, None, "none", [], "")
     return found
 
 
@@ -120,7 +122,7 @@ def bare_products(sizes: Sizes, dtype: th.dtype, device: th.device) -> dict[str,
     blocks.update({f"blocks of {rows} rows": rows for rows in BLOCK_ROWS if rows < sizes.actions})
     return {
         f"{kernel}, {block}": _product(sizes, rows, dtype, device, multiply)
-        for kernel, multiply in kernels(device).items()
+        for kernel, multiply in kernels(device, dtype).items()
         for block, rows in blocks.items()
     }
 
