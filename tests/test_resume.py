@@ -159,10 +159,10 @@ def test_wherever_it_was_stopped_more_often(tmp_path_factory, case, stops, save_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [dict(), dict(env="Hopper-v5", n_steps=3, normalises=True)], ids=["Pendulum", "Hopper"])
-def test_20_000_steps_straight_and_stopped(tmp_path, case):
-    arguments = case | dict(steps=20_000, save_freq=500, eval_freq=2_000, buffer_size=15_000, learning_starts=1_000)
+def test_10_000_steps_straight_and_stopped(tmp_path, case):
+    arguments = case | dict(steps=10_000, save_freq=500, eval_freq=2_000, buffer_size=6_000, learning_starts=1_000)
     straight, stopped = (Training(tmp_path / name, **arguments) for name in ("straight", "stopped"))
-    stops = sorted(random.Random(0).sample(range(600, 20_000), 4))
+    stops = sorted(random.Random(0).sample(range(600, 10_000), 4))
     assert_same(fingerprint(stopped, stopped.run(*stops)), fingerprint(straight, straight.run()))
 
 
