@@ -276,7 +276,7 @@ def training(url):
 @pytest.mark.slow
 @pytest.mark.usefixtures("heeds_interruptions")
 def test_a_sweeps_command_is_killed_interrupted_and_goes_on(tmp_path):
-    sweep = write_sweep(tmp_path, steps=4000, methods=["TD3"], checkpoint_interval=100)
+    sweep = write_sweep(tmp_path, steps=8000, methods=["TD3"], checkpoint_interval=100)
     url = f"sqlite:///{tmp_path}/studies.db"
     command = command_of(sweep, tmp_path, "--workers", "2", "--storage", url)
     with started(command, tmp_path / "home") as process:
