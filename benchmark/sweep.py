@@ -22,7 +22,8 @@ from benchmark.sweeps.checks import check_values
 from benchmark.sweeps.execution import execute
 from benchmark.sweeps.experiments import Sweep, experiments_in_words, included_sweeps, load_sweep, study_name
 from benchmark.sweeps.groups import add_population
-from benchmark.sweeps.processes import add_workers, check_grace, share_of_cores, terminate
+from benchmark.sweeps.processes import add_workers, check_grace, share_of_cores
+from benchmark.sweeps.signals import handle_as_command
 from benchmark.sweeps.storages import STORAGE_ERRORS, open_storage, reason_of
 from benchmark.sweeps.validation import SweepError
 
@@ -114,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     argv = sys.argv[1:] if argv is None else argv
     args = parse(argv)
-    signal.signal(signal.SIGTERM, terminate)
+    handle_as_command()
     try:
         check_grace(args.beat, args.grace)
         names = included_sweeps(args.name)

@@ -21,9 +21,10 @@ from benchmark.common.zoo import shortened_warm_up, warm_up_in_words
 from benchmark.sweeps.checks import check_tuning
 from benchmark.sweeps.entries import base_entry, write_entry
 from benchmark.sweeps.experiments import study_name
-from benchmark.sweeps.processes import add_workers, check_grace, install_signal_handlers, share_of_cores, terminate
+from benchmark.sweeps.processes import add_workers, check_grace, share_of_cores
 from benchmark.sweeps.runs import checkpoint_interval
 from benchmark.sweeps.scoring import PRUNERS, SCORING
+from benchmark.sweeps.signals import handle_as_command, handle_as_worker
 from benchmark.sweeps.storages import STORAGE_ERRORS, open_storage, patiently, reason_of
 from benchmark.sweeps.tune_execution import execute_trials, tune
 from benchmark.sweeps.tuner import Tuner
@@ -128,9 +129,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     argv = sys.argv[1:] if argv is None else argv
     args = parse(argv)
     if args.parent is None:
-        signal.signal(signal.SIGTERM, terminate)
+        handle_as_command()
     else:
-        install_signal_handlers(args.parent)
+        handle_as_worker(args.parent)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
         check_grace(args.beat, args.grace)

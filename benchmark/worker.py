@@ -15,7 +15,8 @@ import torch as th
 
 from benchmark.common.arguments import add_epilog, count
 from benchmark.sweeps.groups import add_population, population_size
-from benchmark.sweeps.processes import add_heartbeats, check_grace, install_signal_handlers
+from benchmark.sweeps.processes import add_heartbeats, check_grace
+from benchmark.sweeps.signals import handle_as_worker
 from benchmark.sweeps.storages import open_storage, patiently
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.worker_loop import execute_runs
@@ -54,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     args = parse(sys.argv[1:] if argv is None else argv)
     check_grace(args.beat, args.grace)
-    install_signal_handlers(args.parent)
+    handle_as_worker(args.parent)
     th.set_num_threads(args.threads)
     ledger = Ledger(patiently(open_storage, args.storage), args.study, args.grace)
     size = population_size(args.population, args.device)

@@ -31,6 +31,15 @@ def _one_thread():
     th.set_num_threads(1)
 
 
+@pytest.fixture(autouse=True)
+def _signal_handlers():
+    """Restore the handlers that a command sets for as long as its process lives."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.fixture
 def gpu(monkeypatch):
     """Show the GPU to a test; without one, skip it."""

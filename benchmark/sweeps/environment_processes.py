@@ -8,7 +8,7 @@ from multiprocessing import connection
 
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
-from benchmark.sweeps.processes import TERMINATED
+from benchmark.sweeps.signals import TERMINATED
 from sb3_cgp.guards.workers import GRACE, discard_replies, end_workers
 
 # Signals that end a process for an error in its own program

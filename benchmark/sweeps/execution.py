@@ -17,6 +17,7 @@ from benchmark.sweeps.exports import check_no_run_is_lost, ended_runs, export_st
 from benchmark.sweeps.processes import start_workers, stop
 from benchmark.sweeps.progress import ProgressTracker, display
 from benchmark.sweeps.runs import overview
+from benchmark.sweeps.signals import end_if_asked
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.worker_loop import forget_ended
 
@@ -97,6 +98,7 @@ def execute(sweep: Sweep, storage: BaseStorage, study: str, args: argparse.Names
                 if n_working == 0:
                     break
                 time.sleep(INTERVAL)
+                end_if_asked()
     except BaseException:
         stop(workers)
         print("Stopped. The same command continues.", file=sys.stderr)

@@ -12,6 +12,7 @@ from optuna.exceptions import UpdateFinishedTrialError
 from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState
 
+from benchmark.sweeps.signals import end_if_asked
 from benchmark.sweeps.storages import patiently
 
 # Defaults: seconds between two heartbeats, and seconds of silence after which a process is taken for lost
@@ -92,8 +93,10 @@ class HeartbeatThread:
 
         :param step: environment steps
         :raises TrialLostError: if another process has ended the trial
+        :raises SystemExit: if a signal has asked the process to end
         """
         self._step = step
+        end_if_asked()
         if self._error is not None:
             raise self._error
 

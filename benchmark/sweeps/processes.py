@@ -1,4 +1,4 @@
-"""Processes that train: how a command starts and stops them, and how they handle signals."""
+"""Processes that train: the arguments on them, and how a command starts and stops them."""
 
 import argparse
 import os
@@ -7,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
 
 from benchmark.common.arguments import count
 from benchmark.sweeps.heartbeats import BEAT, GRACE
@@ -15,8 +14,6 @@ from benchmark.sweeps.storages import DEFAULT_STORAGE
 
 # Seconds between two reads of a study of which nothing waits
 PAUSE = 2.0
-# The exit code of a process that ended because of SIGTERM
-TERMINATED = 128 + signal.SIGTERM
 
 
 def add_workers(parser: argparse.ArgumentParser, logs: str) -> None:
@@ -115,30 +112,3 @@ def stop(workers: Sequence[subprocess.Popen[bytes]]) -> None:
         # Ctrl-C a second time
         for worker in workers:
             worker.kill()
-
-
-def terminate(number: int, frame: FrameType | None) -> None:
-    """
-    End the process with the exit code of a signal.
-
-    :param number: the signal
-    :param frame: the frame that the signal interrupted
-    :raises SystemExit: always
-    """
-    raise SystemExit(128 + number)
-
-
-def _terminate_as_asked(number: int, frame: FrameType | None) -> None:
-    signal.raise_signal(signal.SIGTERM)
-
-
-def install_signal_handlers(parent: int | None) -> None:
-    """
-    Handle signals as a process that trains: on SIGTERM its run is saved and given back.
-
-    :param parent: the process that started this one; None for a process started by hand
-    """
-    signal.signal(signal.SIGTERM, terminate)
-    # Ctrl-C in a terminal reaches all of its processes: the parent then ends this one. Without a parent it gives its run back,
-    # as rl_zoo3 takes Ctrl-C for the end of a training.
-    signal.signal(signal.SIGINT, _terminate_as_asked if parent is None else signal.SIG_IGN)

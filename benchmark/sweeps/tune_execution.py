@@ -8,7 +8,8 @@ from collections.abc import Sequence
 
 from optuna.trial import FrozenTrial, TrialState
 
-from benchmark.sweeps.processes import PAUSE, TERMINATED, start_workers, stop
+from benchmark.sweeps.processes import PAUSE, start_workers, stop
+from benchmark.sweeps.signals import TERMINATED, end_if_asked
 from benchmark.sweeps.study_trials import ERROR
 from benchmark.sweeps.tuner import Tuner, best_of, has_ended
 
@@ -25,6 +26,7 @@ def execute_trials(tuner: Tuner, args: argparse.Namespace) -> None:
     :raises SystemExit: if the process has to end; its trial is given back
     """
     while True:
+        end_if_asked()
         tuner.recover()
         trials = tuner.trials()
         n_ended = sum(map(has_ended, trials))
@@ -65,6 +67,7 @@ def tune(tuner: Tuner, study: str, args: argparse.Namespace, argv: Sequence[str]
                 print(f"{study}: {progress}", file=sys.stderr, flush=True)
                 printed = progress
             time.sleep(INTERVAL)
+            end_if_asked()
     except BaseException:
         stop(workers)
         print("Stopped. The same command continues.", file=sys.stderr)

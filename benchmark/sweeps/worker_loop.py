@@ -16,9 +16,10 @@ from benchmark.sweeps.claimed_runs import ClaimedRuns
 from benchmark.sweeps.groups import FOLDER, RUNS, Group, Groups
 from benchmark.sweeps.heartbeats import BEAT, HeartbeatThread, TrialLostError
 from benchmark.sweeps.population_run import train_group
-from benchmark.sweeps.processes import PAUSE, TERMINATED
+from benchmark.sweeps.processes import PAUSE
 from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, has_state, run_folder, train
 from benchmark.sweeps.runs import Run
+from benchmark.sweeps.signals import TERMINATED, end_if_asked
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import PROCESSORS, RUN, Claim, owned
 
@@ -46,6 +47,7 @@ def execute_runs(
     """
     groups = Groups(logs, ledger.name, population)
     while True:
+        end_if_asked()
         ledger.recover()
         claims, group = groups.claim(ledger, name)
         if claims:

@@ -1,0 +1,206 @@
+"""Signals that ask a sweep's processes to end, also where Python drops the exceptions of their handlers."""
+
+import signal
+import weakref
+from types import SimpleNamespace
+
+import pytest
+from ledgers import trials_of
+from optuna.storages import InMemoryStorage
+from optuna.trial import TrialState
+from stable_baselines3.common.env_util import make_vec_env
+from studies import make_sweep, pretend_to_train, work_through
+from trainings import SMALL, Do
+from tunings import arguments, tuner_of
+
+from benchmark import sweep, tune
+from benchmark.sweeps import execution, signals, tune_execution
+from benchmark.sweeps import worker_loop as worker
+from benchmark.sweeps.storages import open_storage
+from sb3_cgp import CGP
+from sb3_cgp.resumption import TrainingCheckpointCallback
+from sb3_cgp.resumption.store import StateStore
+
+pytestmark = [
+    pytest.mark.usefixtures("heeds_interruptions", "_unasked"),
+    # Those that are raised where they are dropped
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+@pytest.fixture
+def _unasked(monkeypatch):
+    """A process that no signal has asked to end."""
+    monkeypatch.setattr(signals, "_noted", [])
+
+
+class Object:
+    pass
+
+
+def lose(number):
+    """Raise a signal where Python drops its handler's exception."""
+    thing = Object()
+    reference = weakref.ref(thing, lambda _: signal.raise_signal(number))
+    del thing
+    assert reference() is None
+
+
+class Finalizer:
+    def __init__(self, number):
+        self.number = number
+
+    def __del__(self):
+        signal.raise_signal(self.number)
+
+
+def lose_in_finalizer(number):
+    Finalizer(number)
+
+
+HANDLERS = [
+    (signals.handle_as_command, signal.SIGTERM, SystemExit),
+    (signals.handle_as_command, signal.SIGINT, KeyboardInterrupt),
+    (lambda: signals.handle_as_worker(1), signal.SIGTERM, SystemExit),
+    (lambda: signals.handle_as_worker(None), signal.SIGTERM, SystemExit),
+    (lambda: signals.handle_as_worker(None), signal.SIGINT, SystemExit),
+]
+
+
+@pytest.mark.parametrize("drop", [lose, lose_in_finalizer])
+@pytest.mark.parametrize(("handle", "number", "error"), HANDLERS)
+def test_a_signal_whose_exception_is_dropped_is_heeded_later(handle, number, error, drop):
+    handle()
+    signals.end_if_asked()
+    drop(number)
+    with pytest.raises(error) as end:
+        signals.end_if_asked()
+    assert error is KeyboardInterrupt or end.value.code == 143
+
+
+@pytest.mark.parametrize(("handle", "number", "error"), HANDLERS)
+def test_a_signal_ends_the_process_at_once_and_a_second_sigterm_does_not_interrupt_that(handle, number, error):
+    handle()
+    with pytest.raises(error):
+        signal.raise_signal(number)
+    signal.raise_signal(signal.SIGTERM)
+    signal.raise_signal(signal.SIGTERM)
+
+
+def test_ctrl_c_a_second_time_interrupts_a_command_again():
+    signals.handle_as_command()
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGINT):
+        with pytest.raises(BaseException, match=r"143|^$") as error:
+            signal.raise_signal(number)
+        assert isinstance(error.value, SystemExit if number == signal.SIGTERM else KeyboardInterrupt)
+
+
+def test_ctrl_c_is_the_parents_and_that_of_a_command_in_the_background_is_ignored():
+    signals.handle_as_worker(1)
+    signal.raise_signal(signal.SIGINT)
+    signals.handle_as_command()
+    signal.raise_signal(signal.SIGINT)
+    signals.end_if_asked()
+
+
+def test_a_second_sigterm_does_not_keep_a_training_from_saving(tmp_path):
+    """A scheduler sends it to all processes of a job, and the parent once more to its own."""
+    signals.handle_as_worker(1)
+    model = CGP("MlpPolicy", make_vec_env("Pendulum-v1", seed=1), **SMALL | dict(policy_kwargs=dict(net_arch=[8])))
+    ask = Do(33, lambda: signal.raise_signal(signal.SIGTERM))
+    with pytest.raises(SystemExit, match="143"):
+        model.learn(50, [TrainingCheckpointCallback(20, tmp_path), ask, Do(33, ask.function)])
+    assert StateStore(tmp_path).load()[0] >= 33
+
+
+@pytest.mark.parametrize(("when", "ended"), [("before", []), ("during", []), ("after", [0])])
+def test_a_worker_that_lost_a_signal_gives_its_run_back_and_takes_no_other(clock, tmp_path, monkeypatch, when, ended):
+    """... at the run's next step; a signal after the last one comes too late for that."""
+    signals.handle_as_worker(1)
+
+    class Heart:
+        def __init__(self, *_):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *exception):
+            pass
+
+        watch = staticmethod(lambda step: signals.end_if_asked())
+
+    def train(run, folder, report, watch, device):
+        def act(step):
+            if when == "during" and step == 50:
+                lose(signal.SIGTERM)
+            watch(step)
+
+        if when == "before":
+            lose(signal.SIGTERM)
+        value = pretend_to_train(run, folder, report, act, device)
+        if when == "after":
+            lose(signal.SIGTERM)
+        return value
+
+    monkeypatch.setattr(worker, "HeartbeatThread", Heart)
+    monkeypatch.setattr(worker, "train", train)
+    storage = InMemoryStorage()
+    with pytest.raises(SystemExit, match="143"):
+        work_through(storage, make_sweep(["Good"]), clock, tmp_path)
+    states = [trial.state for trial in trials_of(storage)]
+    assert [value for trial in trials_of(storage) for value in trial.values or []] == ended
+    assert TrialState.RUNNING not in states
+    assert states.count(TrialState.WAITING) == 2 - len(ended)
+
+
+def test_a_process_that_tunes_and_lost_a_signal_takes_no_other_trial(work, pretend):
+    signals.handle_as_worker(1)
+    storage = InMemoryStorage()
+    runs = pretend(lambda run: lose(signal.SIGTERM) or 1.0)
+    with pytest.raises(SystemExit, match="143"):
+        work(storage=storage, trials=2, seeds=1)
+    assert len(runs) == 1
+
+
+class Process:
+    """A process that trains until it is asked to end."""
+
+    def __init__(self):
+        self.signals = []
+
+    def poll(self):
+        return -self.signals[0] if self.signals else None
+
+    send_signal = property(lambda self: self.signals.append)
+
+    def wait(self):
+        assert self.signals
+
+
+def start(command, folder):
+    """Do what a command does with its arguments."""
+    if command == "tune":
+        args = tune.parse(arguments("--logs", str(folder)))
+        tune_execution.tune(tuner_of(args, InMemoryStorage()), "study", args, [])
+    else:
+        url = f"sqlite:///{folder}/studies.db"
+        argv = ["e1", "--task", "Pendulum-v1", "--storage", url, "--logs", str(folder), "--results", str(folder)]
+        args = sweep.parse(argv)
+        execution.execute(sweep.load("e1", args), open_storage(url), "study", args, argv)
+
+
+@pytest.mark.parametrize(("number", "error"), [(signal.SIGTERM, SystemExit), (signal.SIGINT, KeyboardInterrupt)])
+@pytest.mark.parametrize("command", ["sweep", "tune"])
+def test_a_command_that_lost_a_signal_ends_its_processes(tmp_path, monkeypatch, capsys, command, number, error):
+    signals.handle_as_command()
+    process = Process()
+    module = execution if command == "sweep" else tune_execution
+    monkeypatch.setattr(module, "start_workers", lambda *_: [process])
+    sleeps = iter([lambda: lose(number)])
+    # A second one is an error
+    monkeypatch.setattr(module, "time", SimpleNamespace(sleep=lambda _: next(sleeps)()))
+    with pytest.raises(error):
+        start(command, tmp_path)
+    assert process.signals == [signal.SIGTERM]
+    assert "The same command continues." in capsys.readouterr().err
