@@ -87,12 +87,16 @@ def test_a_signal_ends_the_process_at_once_and_a_second_sigterm_does_not_interru
     signal.raise_signal(signal.SIGTERM)
 
 
-def test_ctrl_c_a_second_time_interrupts_a_command_again():
-    signals.handle_as_command()
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGINT):
-        with pytest.raises(BaseException, match=r"143|^$") as error:
-            signal.raise_signal(number)
-        assert isinstance(error.value, SystemExit if number == signal.SIGTERM else KeyboardInterrupt)
+@pytest.mark.parametrize(
+    ("handle", "error"), [(signals.handle_as_command, KeyboardInterrupt), (lambda: signals.handle_as_worker(None), SystemExit)]
+)
+def test_ctrl_c_interrupts_each_time(handle, error):
+    handle()
+    with pytest.raises(SystemExit):
+        signal.raise_signal(signal.SIGTERM)
+    for _ in range(2):
+        with pytest.raises(error):
+            signal.raise_signal(signal.SIGINT)
 
 
 def test_ctrl_c_is_the_parents_and_that_of_a_command_in_the_background_is_ignored():
@@ -103,14 +107,17 @@ def test_ctrl_c_is_the_parents_and_that_of_a_command_in_the_background_is_ignore
     signals.end_if_asked()
 
 
-def test_a_second_sigterm_does_not_keep_a_training_from_saving(tmp_path):
-    """A scheduler sends it to all processes of a job, and the parent once more to its own."""
-    signals.handle_as_worker(1)
+@pytest.mark.parametrize(
+    ("parent", "number", "saved"), [(1, signal.SIGTERM, True), (None, signal.SIGTERM, True), (None, signal.SIGINT, False)]
+)
+def test_a_second_sigterm_does_not_keep_a_training_from_saving_but_a_second_ctrl_c_does(tmp_path, parent, number, saved):
+    """A scheduler sends SIGTERM to all processes of a job, and the parent once more to its own."""
+    signals.handle_as_worker(parent)
     model = CGP("MlpPolicy", make_vec_env("Pendulum-v1", seed=1), **SMALL | dict(policy_kwargs=dict(net_arch=[8])))
-    ask = Do(33, lambda: signal.raise_signal(signal.SIGTERM))
+    asking = [Do(33, lambda: signal.raise_signal(number)) for _ in range(2)]
     with pytest.raises(SystemExit, match="143"):
-        model.learn(50, [TrainingCheckpointCallback(20, tmp_path), ask, Do(33, ask.function)])
-    assert StateStore(tmp_path).load()[0] >= 33
+        model.learn(50, [TrainingCheckpointCallback(20, tmp_path), *asking])
+    assert (StateStore(tmp_path).load()[0] >= 33) == saved
 
 
 @pytest.mark.parametrize(("when", "ended"), [("before", []), ("during", []), ("after", [0])])

@@ -54,13 +54,16 @@ def _end(number: int) -> None:
     raise SystemExit(128 + number)
 
 
-def _terminate(number: int, frame: FrameType | None) -> None:
+def _is_ending() -> bool:
     training = StopSignals.current()
+    return len(_noted) > 0 or (training is not None and training.noted is not None)
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
     # A scheduler's signal reaches all processes of a job, and the parent's follows: the second one would interrupt the saving
-    if _noted or (training is not None and training.noted is not None):
-        return
-    _noted.append(number)
-    _end(number)
+    if not _is_ending():
+        _noted.append(number)
+        _end(number)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
@@ -70,4 +73,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _terminate_as_asked(number: int, frame: FrameType | None) -> None:
+    # Ctrl-C a second time does not wait for the saving
+    if _is_ending():
+        _end(signal.SIGTERM)
     signal.raise_signal(signal.SIGTERM)
