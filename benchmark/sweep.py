@@ -60,7 +60,13 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--seeds", type=count, help="number of seeds, from 0, in place of the file's")
     parser.add_argument("--methods", nargs="+", help="methods of the file to train (default: all)")
     parser.add_argument(
-        "--set", nargs="+", type=hyperparameter, default=[], metavar="NAME=VALUE", help="hyperparameters of all methods"
+        "--set",
+        nargs="+",
+        action="extend",
+        type=hyperparameter,
+        default=[],
+        metavar="NAME=VALUE",
+        help="hyperparameters of all methods",
     )
     parser.add_argument(
         "--eval-interval",

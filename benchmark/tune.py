@@ -70,6 +70,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--set",
         nargs="+",
+        action="extend",
         type=hyperparameter,
         default=[],
         metavar="NAME=VALUE",
@@ -98,8 +99,11 @@ def tuning_of(args: argparse.Namespace) -> Tuning:
     packages, _ = split_env_id(args.env)
     task = registered_environment(args.env)
     base = base_entry(args.algo, task, args.conf_file)
-    steps = args.steps or int(base["n_timesteps"])
-    if steps < int(base["n_timesteps"]):
+    usual = int(base.get("n_timesteps", 0))
+    steps = args.steps or usual
+    if not steps:
+        raise ValueError(f"The hyperparameters of {args.algo} for {task} have no n_timesteps: give --steps")
+    if steps < usual:
         shortened = shortened_warm_up(args.algo, base, steps)
         base |= shortened
         if shortened and args.parent is None and "learning_starts" not in dict(args.set):
@@ -139,12 +143,14 @@ def main(argv: Sequence[str] | None = None) -> None:
         tuning = tuning_of(args)
         study = study_name(f"tune-{args.algo}", args.study, [tuning.task])
         storage = open_storage(args.storage) if args.parent is None else patiently(open_storage, args.storage)
+        if args.parent is None:
+            # Before the study notes the settings
+            check_tuning(tuning)
         tuner = Tuner(storage, study, tuning, args.grace)
         if args.parent is not None:
             th.set_num_threads(args.threads)
             execute_trials(tuner, args)
             return
-        check_tuning(tuning)
         best = tune(tuner, study, args, argv)
         entry = tuning.entry(best)
         scores = ", ".join(f"{score:.4g}" for score in best.user_attrs[SCORES])

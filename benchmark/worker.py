@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch as th
 
-from benchmark.common.arguments import add_epilog, count
+from benchmark.common.arguments import add_epilog, count, device_name
 from benchmark.sweeps.groups import add_population, population_size
 from benchmark.sweeps.processes import add_heartbeats, check_grace
 from benchmark.sweeps.signals import handle_as_worker
@@ -34,7 +34,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--storage", required=True, help="the URL of its storage")
     parser.add_argument("--logs", type=Path, required=True, help="the folder of all sweeps' runs")
     parser.add_argument("--threads", type=count, default=1, help="PyTorch's threads (default: %(default)s)")
-    parser.add_argument("--device", default="auto", help="device of the networks (default: %(default)s)")
+    parser.add_argument("--device", type=device_name, default="auto", help="device of the networks (default: %(default)s)")
     add_population(parser)
     add_heartbeats(parser)
     parser.add_argument("--parent", type=int, help="the process whose end is this one's, too")

@@ -212,6 +212,22 @@ def test_processes_forked_during_the_training_end_by_a_signal(number, tmp_path):
     assert ended == [-signal.SIGTERM if number == signal.SIGTERM else 1]
 
 
+def test_a_signal_that_an_error_left_unanswered_reaches_the_handler_from_before(tmp_path, handler):
+    seen = []
+
+    def fail():
+        terminate()
+        raise ValueError("a simulator's")
+
+    signal.signal(signal.SIGTERM, lambda *_: seen.append("before"))
+    try:
+        with pytest.raises(ValueError, match="a simulator's"):
+            make_model().learn(50, [TrainingCheckpointCallback(10, tmp_path), Do(33, fail)])
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    assert seen == ["before"]
+
+
 def test_a_second_sigterm_acts_as_before(tmp_path, handler):
     seen = []
     signal.signal(signal.SIGTERM, lambda *_: seen.append("before"))

@@ -171,6 +171,11 @@ def test_failing_settings(find: Any, axis: str, values: tuple[float, ...], claim
     assert ("0 of" in found.text) == (verdict == CONTRADICTED)
 
 
+def test_named_values_of_an_axis_are_no_numbers(find: Any) -> None:
+    found = find("few initial", runs(lambda *_: 1.0, ["CGP-Online"], [{"learning_starts": name} for name in ("few", "many")]))
+    assert found.verdict == NO_DATA
+
+
 @pytest.mark.parametrize(("high", "verdict"), [(60.0, SUPPORTED), (95.0, CONTRADICTED)])
 def test_a_high_rate_is_compared_with_the_best_other_where_all_else_is_equal(find: Any, high: float, verdict: str) -> None:
     """Neither does a rate that is too low make a high one look good, nor a batch that only one of them was run with."""

@@ -15,7 +15,7 @@ from tables import unpadded
 from benchmark.figures import main
 from benchmark.reporting import figures as command
 from benchmark.reporting.figures import figures, study_folders
-from benchmark.reporting.overview import anchor
+from benchmark.reporting.overview import anchor, finding
 from benchmark.reporting.scores import curves, evaluation_grid, read_study, score_table
 from benchmark.reporting.sections import reward_tables
 
@@ -200,6 +200,30 @@ def test_page_begins_with_the_findings(experiment: str, first: str, tmp_path: Pa
     assert headings[:2] == ["# Results of sweeps", first]
     assert headings[-1] == "## How to read this page"
     assert len([line for line in headings if line == "## The paper's claims"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("levels", "sentences"),
+    [
+        # The difference of CGP-Light and CGP-Online is told under the first
+        ({"CGP-Light": -50, "CGP-Online": -99, "TD3": -99}, ["higher than CGP-Online, TD3", "not distinguishable from TD3"]),
+        ({"CGP-Online": -99, "TD3": -99, "SAC": -99}, ["not distinguishable from any other"]),
+        ({"CGP-Online": -99, "TD3": -99, "SAC": None}, ["not distinguishable from TD3"]),
+        ({"CGP-Online": -99, "TD3": -199, "SAC": -99}, ["higher than TD3; not distinguishable from SAC"]),
+    ],
+)
+def test_a_finding_names_the_methods_that_it_is_about(
+    tmp_path: Path, levels: dict[str, float | None], sentences: list[str]
+) -> None:
+    """... of which None has too few runs."""
+    methods = [method for method, level in levels.items() if level is not None]
+    records = runs(lambda method, _, seed: (levels[method] or 0.0) + seed, methods)
+    records += [record(method, 0, -90.0) for method in levels if method not in methods]
+    study = read_study(write_study(tmp_path / "sweep", records))
+    found = finding(study, score_table([study]), "Pendulum-v1", 20)
+    assert [
+        each.partition("; ")[2].rstrip(".") for each in re.split(r"(?<=[a-zA-Z0-9)])\. ", found) if "; " in each
+    ] == sentences
 
 
 def test_runs_at_numbers_that_are_none(tmp_path: Path) -> None:

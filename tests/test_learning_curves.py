@@ -79,7 +79,9 @@ def test_runs_without_a_time_are_left_out_with_a_note(tmp_path: Path) -> None:
     # A failed run has the time of those that were complete
     assert sorted((run.method, run.seed) for run in times.runs) == [("TD3", 0), ("TD3", 3)]
     assert times.minutes_per_step == {"TD3": pytest.approx(8 / 1_000)}
-    assert minutes_caption(chosen, "Pendulum-v1").endswith("Left out: 3 runs without a recorded time.")
+    assert minutes_caption(chosen, "Pendulum-v1").endswith(
+        "Left out: 2 runs without a recorded time. Left out: 1 run of methods without a complete run with a time."
+    )
     assert "Left out" not in minutes_caption(study(tmp_path, [timed("TD3", 0, 8.0)]), "Pendulum-v1")
 
 
@@ -276,6 +278,21 @@ def test_legend_says_where_seeds_are_missing(tmp_path: Path, drawn: list[Figure]
     chosen = study(tmp_path, [*(timed("CGP-Light", seed, None) for seed in range(4)), timed("TD3", 0, None)])
     curves_by_steps(chosen, "Pendulum-v1", 20)
     assert list(lines(drawn[0].axes[0])) == ["CGP-Light", "TD3 (1 of 4 seeds)"]
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_methods_may_have_different_numbers_of_seeds(tmp_path: Path, drawn: list[Figure]) -> None:
+    records = [*(timed("CGP-Light", seed, 1.0) for seed in range(4)), *(timed("TD3", seed, 1.0) for seed in range(2))]
+    chosen = study(tmp_path, records, seeds_of_methods={"CGP-Light": 4, "TD3": 2})
+    curves_by_steps(chosen, "Pendulum-v1", 20)
+    assert list(lines(drawn[0].axes[0])) == ["CGP-Light", "TD3"]
+    assert {trace["name"] for trace in figure(chosen, "Pendulum-v1", 20)["data"]} == {"CGP-Light", "TD3"}
+    (chosen.folder / "study.json").write_text(json.dumps(chosen.facts))
+    assert "so far" not in figures([chosen.folder], tmp_path, 20).read_text()
+    (chosen.folder / "study.json").write_text(json.dumps(chosen.facts | {"runs_planned": 7, "seeds_of_methods": {"TD3": 3}}))
+    unfinished = unpadded(figures([chosen.folder], tmp_path, 20).read_text())
+    assert "by task and method (planned seeds: 4 of CGP-Light, 3 of TD3):" in unfinished
+    assert "| 2 of 3 so far | 0 |" in unfinished
 
 
 @pytest.mark.parametrize("number", [2, 4])

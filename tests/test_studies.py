@@ -90,6 +90,7 @@ def test_what_the_machine_lacks_is_no_fault_of_the_run(ledger, monkeypatch, tmp_
     assert len(ledger.left()) == 3
 
 
+@pytest.mark.usefixtures("heeds_interruptions")
 def test_the_workers_command_trains_all_runs_of_a_study(tmp_path, monkeypatch):
     url = f"sqlite:///{tmp_path}/studies.db"
     ledger = Ledger(open_storage(url), "study", GRACE)

@@ -8,6 +8,7 @@ import torch as th
 import yaml
 from optuna.trial import TrialState, create_trial
 
+from benchmark import tune, worker
 from benchmark.common.provenance import machine, processor
 from benchmark.common.records import STUDY, Record, read_records, write_records
 from benchmark.sweep import hyperparameter, load, main, parse
@@ -43,6 +44,25 @@ def test_options_replace_what_the_file_says(tmp_path):
         assert (run.hyperparams["gamma"], run.hyperparams["learning_rate"]) == (0.9, 0.01)
         assert run.hyperparams["policy_kwargs"] == "dict(net_arch=[8, 8])"
     assert study_name(sweep.name, args.study, args.task) == "e8-Pendulum-v1"
+
+
+def test_hyperparameters_and_packages_may_be_given_one_by_one(tmp_path):
+    several = "--set gamma=0.9 tau=0.02 --set tau=0.01 --gym-packages one --gym-packages two"
+    args = parse(["e3", *several.split(), "--results", str(tmp_path)])
+    assert (dict(args.set), args.gym_packages) == ({"gamma": 0.9, "tau": 0.01}, ["one", "two"])
+    assert parse(["e3", "--results", str(tmp_path)]).set == []
+
+
+@pytest.mark.parametrize("parse", [parse, worker.parse, tune.parse])
+def test_a_device_that_is_not_there_is_refused_before_it_can_fail_runs(tmp_path, capsys, parse):
+    needed = {
+        worker.parse: ["--study", "e3", "--storage", "sqlite:///a.db", "--logs", str(tmp_path)],
+        tune.parse: ["--algo", "td3", "--env", "Pendulum-v1"],
+    }
+    for device in ("cdua", "cuda:7"):
+        with pytest.raises(SystemExit):
+            parse([*needed.get(parse, ["e3", "--results", str(tmp_path)]), "--device", device])
+        assert f"argument --device: '{device}' is not available" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

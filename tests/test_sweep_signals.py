@@ -2,6 +2,7 @@
 
 import signal
 import weakref
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -17,6 +18,7 @@ from benchmark import sweep, tune
 from benchmark.sweeps import execution, signals, tune_execution
 from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.storages import open_storage
+from benchmark.sweeps.studies import Ledger
 from sb3_cgp import CGP
 from sb3_cgp.resumption import TrainingCheckpointCallback
 from sb3_cgp.resumption.store import StateStore
@@ -102,8 +104,9 @@ def test_ctrl_c_interrupts_each_time(handle, error):
 def test_ctrl_c_is_the_parents_and_that_of_a_command_in_the_background_is_ignored():
     signals.handle_as_worker(1)
     signal.raise_signal(signal.SIGINT)
-    signals.handle_as_command()
-    signal.raise_signal(signal.SIGINT)
+    for handle in (signals.handle_as_command, lambda: signals.handle_as_worker(None)):
+        handle()
+        signal.raise_signal(signal.SIGINT)
     signals.end_if_asked()
 
 
@@ -159,6 +162,62 @@ def test_a_worker_that_lost_a_signal_gives_its_run_back_and_takes_no_other(clock
     assert [value for trial in trials_of(storage) for value in trial.values or []] == ended
     assert TrialState.RUNNING not in states
     assert states.count(TrialState.WAITING) == 2 - len(ended)
+
+
+def learn(folder, function):
+    """Train with states, and call a function at step 33."""
+    model = CGP("MlpPolicy", make_vec_env("Pendulum-v1", seed=1), **SMALL | dict(policy_kwargs=dict(net_arch=[8])))
+    model.learn(50, [TrainingCheckpointCallback(20, folder), Do(33, function)])
+
+
+def test_a_run_that_fails_after_a_signal_is_given_back(clock, tmp_path, monkeypatch):
+    """The signal may have ended a simulator, too."""
+
+    def fail():
+        signal.raise_signal(signal.SIGTERM)
+        raise ValueError("a simulator's")
+
+    signals.handle_as_worker(1)
+    monkeypatch.setattr(worker, "train", lambda run, folder, *_: learn(folder / "state", fail))
+    storage = InMemoryStorage()
+    with pytest.raises(SystemExit, match="143"):
+        work_through(storage, make_sweep(["Good"]), clock, tmp_path)
+    trials = trials_of(storage)
+    assert [trial.user_attrs["error"] for trial in trials if "error" in trial.user_attrs] == []
+    assert [trial.state for trial in trials].count(TrialState.WAITING) == 2
+
+
+def once(method):
+    """Let a second signal arrive after the first call of a method."""
+    calls = iter([lambda: signal.raise_signal(signal.SIGTERM)])
+
+    def act(*args, **kwargs):
+        result = method(*args, **kwargs)
+        next(calls, lambda: None)()
+        return result
+
+    return act
+
+
+def test_a_second_signal_does_not_interrupt_the_giving_back_of_a_run(clock, tmp_path, monkeypatch):
+    signals.handle_as_worker(1)
+    ask = partial(signal.raise_signal, signal.SIGTERM)
+    monkeypatch.setattr(worker, "train", lambda run, folder, *_: learn(folder / "state", ask))
+    monkeypatch.setattr(Ledger, "_end", once(Ledger._end))
+    storage = InMemoryStorage()
+    with pytest.raises(SystemExit, match="143"):
+        work_through(storage, make_sweep(["Good"]), clock, tmp_path)
+    assert [trial.state for trial in trials_of(storage)].count(TrialState.WAITING) == 2
+
+
+def test_a_second_signal_does_not_interrupt_the_giving_back_of_a_configuration(work, pretend, tmp_path, monkeypatch):
+    signals.handle_as_worker(1)
+    storage = InMemoryStorage()
+    pretend(lambda run: learn(tmp_path, partial(signal.raise_signal, signal.SIGTERM)))
+    monkeypatch.setattr(storage, "set_trial_state_values", once(storage.set_trial_state_values))
+    with pytest.raises(SystemExit, match="143"):
+        work(storage=storage, trials=1)
+    assert [trial.state for trial in storage.get_all_trials(0)] == [TrialState.FAIL, TrialState.WAITING]
 
 
 def test_a_process_that_tunes_and_lost_a_signal_takes_no_other_trial(work, pretend):

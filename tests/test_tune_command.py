@@ -26,6 +26,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
     [
         (["--env", "Pendulum-v0"], "must be a registered environment"),
         (["--conf-file", "others.yml"], "Hyperparameters not found"),
+        (["--conf-file", "missing.yml"], "The file of hyperparameters missing.yml cannot be read: No such file"),
         (["--conf-file", "objects.py"], "The hyperparameters of td3 for Pendulum-v1 are no plain data"),
         (["--storage", "studies.db"], "must be a database's URL"),
         (["--storage", "sqlite://"], "in the memory of one process"),
@@ -46,6 +47,22 @@ def test_mistakes_end_the_command(tmp_path, monkeypatch, argv, message):
     Path("objects.py").write_text("hyperparams = {'default': {'policy': object()}}")
     with pytest.raises(SystemExit, match=message):
         tune.main([*arguments(), "--logs", str(tmp_path), *argv])
+
+
+def test_a_corrected_command_needs_no_other_study(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.yml").write_text("Pendulum-v1: {policy: MlpPolicy}")
+    started = []
+    monkeypatch.setattr(tune, "tune", lambda *args: started.append(args) or sys.exit("started"))
+    command = ["--algo", "td3", "--env", "Pendulum-v1", "--conf-file", "mine.yml", "--storage", "sqlite:///studies.db"]
+    for argv, message in [
+        (["--steps", "60", "--set", "learning_rat=0.1"], "learning_rat: no hyperparameter of the tuned method"),
+        (["--set", "learning_rate=0.1"], "The hyperparameters of td3 for Pendulum-v1 have no n_timesteps: give --steps"),
+        (["--steps", "60", "--set", "learning_rate=0.1"], "started"),
+    ]:
+        with pytest.raises(SystemExit, match=message):
+            tune.main([*command, *argv])
+    assert len(started) == 1
 
 
 def test_the_command_writes_what_rl_zoo3_trains(tmp_path, monkeypatch):

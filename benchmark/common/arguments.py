@@ -45,6 +45,19 @@ def device(text: str) -> th.device:
     return found
 
 
+def device_name(text: str) -> str:
+    """
+    Check the name of a device, for processes that this one starts; "auto" is resolved by them.
+
+    :param text: the argument
+    :return: the text
+    :raises argparse.ArgumentTypeError: if no such device is available
+    """
+    if text != "auto":
+        device(text)
+    return text
+
+
 def continuous_environment(text: str) -> str:
     """
     Read the id of an environment, and check that it can be made and has continuous actions.

@@ -21,12 +21,15 @@ def read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str
     :param env_id: a registered environment
     :param conf_file: a YAML file; None for the algorithm's own
     :return: the entry
-    :raises ValueError: if the file has neither an entry for the task nor a default
+    :raises ValueError: if the file cannot be read, or has neither an entry for the task nor a default
     """
     register()
     manager = ExperimentManager(argparse.Namespace(), algo, env_id, log_folder="", config=conf_file, verbose=0)
-    with silence():
-        hyperparams, _ = manager.read_hyperparameters()
+    try:
+        with silence():
+            hyperparams, _ = manager.read_hyperparameters()
+    except OSError as error:
+        raise ValueError(f"The file of hyperparameters {conf_file} cannot be read: {error.strerror}") from error
     return dict(hyperparams)
 
 

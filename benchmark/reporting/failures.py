@@ -34,7 +34,9 @@ def few_steps_fail(table: pd.DataFrame, repetitions: int) -> list[Part]:
     :return: the comparison with the most, if several were tried
     """
     varied = table[_has(table, INITIAL_STEPS)]
-    steps = pd.Series([values[INITIAL_STEPS] for values in varied["values"]], varied.index, dtype=float)
+    given = pd.Series([values[INITIAL_STEPS] for values in varied["values"]], varied.index, dtype=object)
+    # A named value of a user's axis is no number
+    steps = pd.to_numeric(given, errors="coerce")
     most = steps.groupby(varied["study"]).transform("max")
     return _fails(varied, INITIAL_STEPS, steps < most, repetitions)
 

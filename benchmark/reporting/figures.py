@@ -199,14 +199,17 @@ def minutes_caption(study: Study, task: str) -> str:
     :return: the caption, with the number of runs that are left out, and a warning if the runs were on several machines
     """
     shown = shown_methods(study, task)
-    ran = sum(record.task == task and record.method in shown for record in study.records)
+    records = [record for record in study.records if record.task == task and record.method in shown]
     times = times_of(study, task)
-    left_out = ran - len(times.runs)
+    untimed = sum(record.processor_seconds is None for record in records)
+    incomplete = len(records) - untimed - len(times.runs)
     sentences = [MINUTES.format(task)]
     if any(record.task == task and record.population > 1 for record in study.records):
         sentences.append("The time of runs that were trained as one population is the process's, divided by their number.")
-    if left_out:
-        sentences.append(f"Left out: {left_out} run{'s' * (left_out > 1)} without a recorded time.")
+    if untimed:
+        sentences.append(f"Left out: {untimed} run{'s' * (untimed > 1)} without a recorded time.")
+    if incomplete:
+        sentences.append(f"Left out: {incomplete} run{'s' * (incomplete > 1)} of methods without a complete run with a time.")
     if len(times.all_processors) > 1:
         is_one = len(times.processors) == 1
         consequence = f"; the times are those on {times.processors[0]}" if is_one else ", so their times differ"

@@ -75,7 +75,7 @@ def _method(
     (look,) = styles([method]).values()
     floor, grid = floors(study.records)[task], evaluation_grid(study.records, task)
     lines = curves(runs, floor, grid)
-    planned = len(study.facts["seeds"])
+    planned = study.planned_seeds(method)
     name = method if len(runs) >= planned else f"{method} ({len(runs)} of {planned} seeds)"
 
     def trace(kind: str, y: np.ndarray, is_timed: bool, **options: Any) -> Trace:

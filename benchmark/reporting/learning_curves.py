@@ -223,5 +223,5 @@ def _mark(panel: Axes, entry: Published) -> None:
 
 def _label(study: Study, method: str, runs: Sequence[Record]) -> str:
     """Return a method's name, with the number of its runs where some of its seeds are missing."""
-    planned = len(study.facts["seeds"])
+    planned = study.planned_seeds(method)
     return method if len(runs) >= planned else f"{method} ({len(runs)} of {planned} seeds)"

@@ -6,7 +6,15 @@ from dataclasses import dataclass
 import pandas as pd
 
 from benchmark.common.tables import markdown_table
-from benchmark.reporting.comparisons import HIGHER, LOWER, RANDOM, TOO_FEW, difference_in_words, pairs_of, task_difference
+from benchmark.reporting.comparisons import (
+    HIGHER,
+    LOWER,
+    NOT_DISTINGUISHABLE,
+    RANDOM,
+    difference_in_words,
+    pairs_of,
+    task_difference,
+)
 from benchmark.reporting.estimates import (
     FEWEST_RUNS,
     REPETITIONS,
@@ -106,9 +114,10 @@ def _differences(table: pd.DataFrame, task: str, ours: str, methods: Sequence[st
         if found is not None:
             words.setdefault(difference_in_words(found), []).append(pair[1])
     told = [f"{word} than {', '.join(words[word])}" for word in (HIGHER, LOWER) if word in words]
-    if not told and set(words) != {TOO_FEW}:
-        told = ["not distinguishable from any other"] * bool(words)
-    return "; " + ", ".join(told) if told else ""
+    if NOT_DISTINGUISHABLE in words:
+        equals = words[NOT_DISTINGUISHABLE]
+        told.append(f"{NOT_DISTINGUISHABLE} from {'any other' if {*equals, ours} == set(methods) else ', '.join(equals)}")
+    return "; " + "; ".join(told) if told else ""
 
 
 def anchor(title: str) -> str:

@@ -47,6 +47,15 @@ class Study:
         ended = [record.task for record in self.records]
         return [task for task in dict.fromkeys([*self.facts["tasks"], *ended]) if task in ended]
 
+    def planned_seeds(self, method: str) -> int:
+        """
+        Return the number of seeds with which a method is trained.
+
+        :param method: the method
+        :return: the number; that of all seeds for studies that earlier versions described
+        """
+        return self.facts.get("seeds_of_methods", {}).get(method, len(self.facts["seeds"]))
+
     @cached_property
     def axes(self) -> dict[str, list[Any]]:
         """The values of each axis that some run has, the planned ones first."""

@@ -159,8 +159,15 @@ def ended_runs(study: Study) -> list[str]:
     number = Counter((record.task, record.method) for record in study.records)
     tasks = dict.fromkeys([*study.facts["tasks"], *study.tasks])
     rows = [[task, *(str(number[task, method]) for method in study.methods)] for task in tasks]
-    planned = "" if study.axes else f" ({len(study.facts['seeds'])} seeds of each are planned)"
+    planned = "" if study.axes else f" ({_planned(study)})"
     return [f"Runs that have ended, by task and method{planned}:", markdown_table(["task", *study.methods], rows)]
+
+
+def _planned(study: Study) -> str:
+    numbers = {method: study.planned_seeds(method) for method in study.methods}
+    if len(set(numbers.values())) == 1:
+        return f"{numbers[study.methods[0]]} seeds of each are planned"
+    return "planned seeds: " + ", ".join(f"{number} of {method}" for method, number in numbers.items())
 
 
 def conditions(study: Study) -> str:
@@ -247,13 +254,13 @@ def reward_tables(table: pd.DataFrame, study: Study, repetitions: int = REPETITI
 def _reward_table(table: pd.DataFrame, columns: list[str], study: Study, repetitions: int) -> str:
     first = {text: number for number, text in enumerate(dict.fromkeys([*table["task"], *table["settings"], *study.methods]))}
     groups = [([str(name) for name in names], runs) for names, runs in table.groupby(columns)]
-    planned = len(study.facts["seeds"])
     rows = []
     for names, runs in sorted(groups, key=lambda group: [first[name] for name in group[0]]):
         form = number_format(table[table["task"] == names[0]]["score"])
         found = estimate(interquartile_mean, [cells_of(runs, "score")], repetitions)
         scores = runs["score"]
         numbers = [f"{value:{form}}" for value in (scores.mean(), scores.min(), scores.max())]
+        planned = study.planned_seeds(names[-1])
         ended = f"{len(runs)} of {planned} so far" if not study.axes and len(runs) < planned else str(len(runs))
         rows.append([*names, found.in_words(form), *numbers, ended, str(runs["failed"].sum())])
     header = [*columns, "interquartile mean (95 % interval)", "mean", "lowest", "highest", "runs", "failed"]

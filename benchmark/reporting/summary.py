@@ -62,7 +62,7 @@ def _draw_learning(panel: Axes, study: Study, repetitions: int) -> None:
         lines = curves(runs, floor, grid)
         middle, interval = bootstrap(interquartile_mean, [[lines]], repetitions)
         draw_seeds(panel, grid, lines, look["color"])
-        planned = len(study.facts["seeds"])
+        planned = study.planned_seeds(method)
         draw_line(panel, grid, middle, method if len(runs) >= planned else f"{method}, {len(runs)} of {planned} seeds", look)
         if interval is not None:
             panel.fill_between(grid, *interval, color=look["color"], **BAND)

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmark.common.arguments import count
+from benchmark.common.arguments import count, device_name
 from benchmark.sweeps.heartbeats import BEAT, GRACE
 from benchmark.sweeps.storages import DEFAULT_STORAGE
 
@@ -27,11 +27,15 @@ def add_workers(parser: argparse.ArgumentParser, logs: str) -> None:
         "--storage", default=DEFAULT_STORAGE, help="a database's URL, or grpc://host:port (default: %(default)s)"
     )
     parser.add_argument(
-        "--gym-packages", nargs="+", default=[], help="modules to import, which register environments, as in rl_zoo3"
+        "--gym-packages",
+        nargs="+",
+        action="extend",
+        default=[],
+        help="modules to import, which register environments, as in rl_zoo3",
     )
     parser.add_argument("--workers", type=count, default=1, help="processes on this machine (default: %(default)s)")
     parser.add_argument("--threads", type=count, help="PyTorch's threads in each (default: the cores' share)")
-    parser.add_argument("--device", default="auto", help="device of the networks (default: %(default)s)")
+    parser.add_argument("--device", type=device_name, default="auto", help="device of the networks (default: %(default)s)")
     parser.add_argument("--logs", type=Path, default=Path(logs), help="folder of the runs (default: %(default)s)")
     add_heartbeats(parser)
 

@@ -58,14 +58,17 @@ def overview(runs: Iterable[Run], methods: Iterable[str], tasks: Iterable[str]) 
     :param runs: the runs, some perhaps more than once
     :param methods: all methods of the sweep, in order
     :param tasks: all environments of the sweep, in order
-    :return: the methods, tasks and seeds of the runs, their number, and the hyperparameters of each configuration
+    :return: the methods, tasks and seeds of the runs, the number of seeds of each method, that of all runs, and the
+        hyperparameters of each configuration
     """
     by_key = {run.key: run for run in runs}
     ordered = sorted(by_key.values(), key=lambda run: run.configuration)
+    present = [method for method in methods if any(run.method == method for run in ordered)]
     return {
-        "methods": [method for method in methods if any(run.method == method for run in ordered)],
+        "methods": present,
         "tasks": [task for task in tasks if any(run.task == task for run in ordered)],
         "seeds": sorted({run.seed for run in ordered}),
+        "seeds_of_methods": {method: len({run.seed for run in ordered if run.method == method}) for method in present},
         "runs_planned": len(ordered),
         "configurations": {run.configuration: {"algo": run.algo, **run.hyperparams} for run in ordered},
     }

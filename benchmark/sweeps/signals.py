@@ -7,6 +7,9 @@ process calls :func:`end_if_asked`, which raises the exception again.
 """
 
 import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 from sb3_cgp.resumption.signals import StopSignals
@@ -45,7 +48,22 @@ def handle_as_worker(parent: int | None) -> None:
     signal.signal(signal.SIGTERM, _terminate)
     # Ctrl-C in a terminal reaches all of its processes: the parent then ends this one. Without a parent it gives its run back,
     # as rl_zoo3 takes Ctrl-C for the end of a training.
-    signal.signal(signal.SIGINT, _terminate_as_asked if parent is None else signal.SIG_IGN)
+    if parent is not None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    elif signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, _terminate_as_asked)
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Ignore SIGTERM within a ``with`` block in which a process that ends gives its runs back."""
+    is_main = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGTERM, signal.SIG_IGN) if is_main else None
+    try:
+        yield
+    finally:
+        if handler is not None:
+            signal.signal(signal.SIGTERM, handler)
 
 
 def _end(number: int) -> None:

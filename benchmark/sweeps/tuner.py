@@ -21,6 +21,7 @@ from optuna.trial import FrozenTrial, TrialState
 from benchmark.sweeps.heartbeats import HeartbeatThread, SilenceDetector, TrialLostError, send_beat
 from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, run_folder, train
 from benchmark.sweeps.scoring import PRUNERS, SCORING
+from benchmark.sweeps.signals import undisturbed
 from benchmark.sweeps.storages import patiently
 from benchmark.sweeps.study_trials import ERROR, OUTCOME
 from benchmark.sweeps.tuning import ORIGIN, SCORES, Tuning
@@ -129,13 +130,15 @@ class Tuner:
         except (TrialLostError, UpdateFinishedTrialError):
             print(f"Trial {trial.number} was given to another process", flush=True)
         except MACHINE_ERRORS:
-            self._give_back(trial.number, STOPPED)
+            with undisturbed():
+                self._give_back(trial.number, STOPPED)
             raise
         except Exception as error:
             traceback.print_exc()
             self._fail(trial_id, error)
         except BaseException:
-            self._give_back(trial.number, STOPPED)
+            with undisturbed():
+                self._give_back(trial.number, STOPPED)
             raise
 
     def _scores(

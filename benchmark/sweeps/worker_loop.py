@@ -19,7 +19,7 @@ from benchmark.sweeps.population_run import train_group
 from benchmark.sweeps.processes import PAUSE
 from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, has_state, run_folder, train
 from benchmark.sweeps.runs import Run
-from benchmark.sweeps.signals import TERMINATED, end_if_asked
+from benchmark.sweeps.signals import TERMINATED, end_if_asked, undisturbed
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import PROCESSORS, RUN, Claim, owned
 
@@ -93,7 +93,8 @@ def _train_claimed(
             print(f"{_in_words(claims, group)} was given to another process", flush=True)
             claimed.release()
         except MACHINE_ERRORS:
-            claimed.release()
+            with undisturbed():
+                claimed.release()
             raise
         except Exception as error:
             traceback.print_exc()
@@ -104,7 +105,8 @@ def _train_claimed(
                     _forget(group, folders)
                 claimed.dissolve(error)
         except BaseException:
-            claimed.release()
+            with undisturbed():
+                claimed.release()
             raise
 
 

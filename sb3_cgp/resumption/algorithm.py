@@ -257,6 +257,8 @@ class ResumableAlgorithm(ResumableModel):
             # A terminal sends Ctrl-C to the environments' processes, too, which end by it
             if self._is_interrupted and any(isinstance(each, LOST_PROCESS) for each in (error, error.__cause__)):
                 self._stop_if_asked()
+            for each in self._checkpoints():
+                each.signals.pass_on()
             raise
         except KeyboardInterrupt as error:
             # Of a training within a callback: name the state of this one. Python's own, of a second Ctrl-C, has no arguments.

@@ -22,6 +22,8 @@ class StopSignals:
     def __init__(self) -> None:
         self.noted: int | None = None
         self._previous: dict[int, Any] = {}
+        # The handler that the noted signal had
+        self._noted_handler: Any = None
         self._process = 0
 
     def watch(self) -> None:
@@ -54,9 +56,15 @@ class StopSignals:
     def release(self) -> None:
         """Restore the handlers, and forget the noted signal, at the end of the training."""
         self.restore()
-        self.noted = None
+        self.noted = self._noted_handler = None
         if StopSignals._current is self:
             StopSignals._current = None
+
+    def pass_on(self) -> None:
+        """Call the handler that a noted SIGTERM had, if Python has set one: an error has ended the training before it did."""
+        if self.noted == signal.SIGTERM and callable(self._noted_handler):
+            self.noted = None
+            self._noted_handler(signal.SIGTERM, None)
 
     @classmethod
     def current(cls) -> Optional["StopSignals"]:
@@ -65,12 +73,13 @@ class StopSignals:
         return current if current is not None and is_main and current._process == os.getpid() else None
 
     def _note(self, number: int, frame: FrameType | None) -> None:
+        handler = self._previous.get(number)
         self.restore()
         if os.getpid() != self._process:
             # This process was forked during the training, by a simulator for example: the signal has its usual effect
             os.kill(os.getpid(), number)
             return
-        self.noted = number
+        self.noted, self._noted_handler = number, handler
         if number == signal.SIGINT:
             # `print` in a handler may interrupt another `print`
             os.write(2, MESSAGE)
