@@ -11,7 +11,7 @@ from finished_studies import record, runs, write_study
 from tables import unpadded
 
 from benchmark.common.records import Record
-from benchmark.reporting.claims import findings
+from benchmark.reporting.claims import best_or_second, equal_variants, findings
 from benchmark.reporting.figures import figures
 from benchmark.reporting.scores import read_study, score_table
 from benchmark.reporting.verdicts import CONTRADICTED, NO_DATA, NOT_DECIDED, SUPPORTED, Finding
@@ -97,6 +97,28 @@ def test_ranks_are_within_a_study(tmp_path: Path) -> None:
     assert found.verdict == SUPPORTED
     assert len(found.parts) == 1
     assert "rank 1 of 3" in found.text
+
+
+def test_equal_methods_are_not_told_apart_by_chance(tmp_path: Path) -> None:
+    """The second best of several rivals is lower than its mean by chance, and the range of three means is positive."""
+    draw, n_studies = np.random.default_rng(0), 60
+
+    def table(methods: list[str], n_settings: int, seeds: int) -> pd.DataFrame:
+        level = draw.normal(60, 15, n_settings)
+        settings = [{"width": width} for width in range(n_settings)] if n_settings > 1 else [{}]
+        drawn = runs(
+            lambda _, chosen, seed: float(np.clip(draw.normal(level[chosen.get("width", 0)], 15), 0, 100)),
+            methods,
+            settings,
+            range(seeds),
+        )
+        scale = record("Random", 99, 100.0, returns=[0.0], settings=settings[0])
+        return score_table([read_study(write_study(tmp_path / "sweep", [*drawn, scale]))])
+
+    ranks = [best_or_second(table(["CGP-Online", "TD3", "SAC"], 1, 4)) for _ in range(n_studies)]
+    gaps = [equal_variants(table(VARIANTS, 8, 2), 100) for _ in range(n_studies)]
+    assert [Finding("", each).verdict for each in ranks].count(SUPPORTED) <= 0.07 * n_studies
+    assert [Finding("", each).verdict for each in gaps].count(CONTRADICTED) <= 0.07 * n_studies
 
 
 def test_own_variants_and_random_actions_are_no_rivals(find: Any) -> None:

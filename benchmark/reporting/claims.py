@@ -1,12 +1,13 @@
 """The paper's claims, each tested on the runs of the studies."""
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from benchmark.reporting.comparisons import RANDOM
+from benchmark.reporting.comparisons import RANDOM, task_difference
 from benchmark.reporting.estimates import (
     FEWEST_RUNS,
     REPETITIONS,
@@ -43,7 +44,8 @@ configurations and seeds: it is 0 for a method that always fails, too, so read i
 and *equal* allow {MARGIN:g} of the range, *independent* allows {COST_MARGIN:.0%}. *Fails* means that the mean loses
 {FAILURE:g} of the range against the best of the other values, chosen by these data, where all else is equal. "Best or second
 best" is among {OURS} and all methods but its variants, {IMITATED} and {RANDOM}, in studies that vary no hyperparameter,
-on each task by itself. E10, whose tasks are not the paper's, does not count for any claim."""
+on each task by itself: *{SUPPORTED}* if {OURS} is higher than all rivals but one, *{CONTRADICTED}* if it is lower than two, by
+the intervals of the tables of differences. E10, whose tasks are not the paper's, does not count for any claim."""
 
 
 def findings(table: pd.DataFrame, runtime: dict[str, Any] | None, repetitions: int = REPETITIONS) -> list[Finding]:
@@ -57,7 +59,7 @@ def findings(table: pd.DataFrame, runtime: dict[str, Any] | None, repetitions: i
     """
     swept = table[table["settings"] != ""]
     return [
-        Finding("best or second best on every task", best_or_second(table[table["settings"] == ""], repetitions)),
+        Finding("best or second best on every task", best_or_second(table[table["settings"] == ""])),
         Finding(
             f"narrower interquartile range over hyperparameters and seeds than {', '.join(BASELINES)}",
             narrower(swept, repetitions),
@@ -72,29 +74,26 @@ def findings(table: pd.DataFrame, runtime: dict[str, Any] | None, repetitions: i
     ]
 
 
-def best_or_second(table: pd.DataFrame, repetitions: int) -> list[Part]:
+def best_or_second(table: pd.DataFrame) -> list[Part]:
     """
-    Test whether at most one rival is better: by the lead over the second best rival.
+    Test whether at most one rival is better: by the differences from all rivals.
 
     :param table: the scores of runs that vary no hyperparameter
-    :param repetitions: number of bootstrap samples
-    :return: a comparison for each task of each study that has two rivals
+    :return: a part for each task of each study that has two rivals
     """
-
-    def lead(ours: np.ndarray, *theirs: np.ndarray) -> np.ndarray:
-        return interquartile_mean(ours) - np.sort([interquartile_mean(each) for each in theirs], axis=0)[-2]
-
     parts = []
     for _, runs in table.groupby("cell", sort=False):
         rivals = sorted(method for method in set(runs["method"]) - {IMITATED, RANDOM} if not method.startswith(VARIANTS))
         if OURS in set(runs["method"]) and len(rivals) >= 2:
-            found = compare(runs, (OURS, *rivals), lead, repetitions=repetitions)
-            assert found is not None
-            means = _each(runs, (OURS, *rivals), interquartile_mean)
+            task = runs["task"].iloc[0]
+            leads = [task_difference(runs, task, (OURS, rival), "share") for rival in rivals]
+            verdicts = [NOT_DECIDED if lead is None else judge(lead, more_than=0) for lead in leads]
+            means = _each(runs, (OURS, *rivals), lambda scores: scores.mean(axis=1))
             rank = 1 + sum(mean > means[0] for mean in means[1:])
-            place = f"rank {rank} of {len(means)} on {runs['task'].iloc[0]}"
-            text = f"{place}, lead over the second best rival {found.in_words('.3f')}"
-            parts.append(Part(text, judge(found, more_than=0)))
+            higher, lower = verdicts.count(SUPPORTED), verdicts.count(CONTRADICTED)
+            verdict = SUPPORTED if higher >= len(rivals) - 1 else CONTRADICTED if lower >= 2 else NOT_DECIDED
+            place = f"rank {rank} of {len(means)} on {task}"
+            parts.append(Part(f"{place}, higher than {higher} and lower than {lower} of {len(rivals)} rivals", verdict))
     return parts
 
 
@@ -175,20 +174,14 @@ def equal_variants(table: pd.DataFrame, repetitions: int) -> list[Part]:
 
     :param table: the scores of runs that vary hyperparameters
     :param repetitions: number of bootstrap samples
-    :return: the comparison, if all four were run
+    :return: a comparison for each pair of the three variants, if all four were run
     """
 
     def better_half(scores: np.ndarray) -> np.ndarray:
         return np.sort(scores, axis=1)[:, scores.shape[1] // 2 :].mean(axis=1)
 
-    def largest_gap(*scores: np.ndarray) -> np.ndarray:
-        return np.ptp([better_half(each) for each in scores[:3]], axis=0)
-
-    found = compare(table, FAMILY, largest_gap, repetitions=repetitions)
-    if found is None:
-        return []
-    text = f"better halves: {_listed(table, better_half)}; largest gap among the first three {found.in_words('.3f')}"
-    return [Part(text, judge(found, less_than=MARGIN))]
+    pairs = list(combinations(FAMILY[:3], 2))
+    return _differences(table, pairs, "better half", better_half, repetitions, more_than=-MARGIN, less_than=MARGIN)
 
 
 def best_at_the_bottom(table: pd.DataFrame, repetitions: int) -> list[Part]:
@@ -197,20 +190,32 @@ def best_at_the_bottom(table: pd.DataFrame, repetitions: int) -> list[Part]:
 
     :param table: the scores of runs that vary hyperparameters
     :param repetitions: number of bootstrap samples
-    :return: the comparison, if all four were run
+    :return: a comparison with each other variant, if all four were run
     """
 
     def lowest_quarter(scores: np.ndarray) -> np.ndarray:
         return np.sort(scores, axis=1)[:, : -(-scores.shape[1] // 4)].mean(axis=1)
 
-    def lead(ours: np.ndarray, *theirs: np.ndarray) -> np.ndarray:
-        return lowest_quarter(ours) - np.max([lowest_quarter(each) for each in theirs], axis=0)
+    pairs = [(OURS, other) for other in FAMILY if other != OURS]
+    return _differences(table, pairs, "lowest quarter", lowest_quarter, repetitions, more_than=0.0)
 
-    found = compare(table, FAMILY, lead, repetitions=repetitions)
-    if found is None:
-        return []
-    text = f"lowest quarters: {_listed(table, lowest_quarter)}; lead over the best other {found.in_words('.3f')}"
-    return [Part(text, judge(found, more_than=0))]
+
+def _differences(
+    table: pd.DataFrame, pairs: Sequence[tuple[str, str]], name: str, statistic: Statistic, repetitions: int, **bounds: float
+) -> list[Part]:
+    """
+    Compare a statistic of pairs of variants, where all variants were run.
+
+    Each pair is a comparison of its own, as the bootstrap of a maximum over methods, or of their range, is biased.
+    """
+    common, parts = in_common(table, FAMILY), []
+    for pair in pairs:
+        found = compare(common, pair, lambda ours, theirs: statistic(ours) - statistic(theirs), repetitions=repetitions)
+        if found is not None:
+            ours, theirs = _each(common, pair, statistic)
+            text = f"{name} of {pair[0]} {ours:.2f}, of {pair[1]} {theirs:.2f}: higher by {found.in_words('.3f')}"
+            parts.append(Part(text, judge(found, **bounds)))
+    return parts
 
 
 def online_better(table: pd.DataFrame, repetitions: int) -> list[Part]:
@@ -238,8 +243,3 @@ def _each(table: pd.DataFrame, methods: Sequence[str], statistic: Statistic) -> 
         return float(np.mean([statistic(shares.to_numpy()[None])[0] for _, shares in runs.groupby("task")["share"]]))
 
     return [mean_over_tasks(common[common["method"] == method]) for method in methods]
-
-
-def _listed(table: pd.DataFrame, statistic: Statistic) -> str:
-    values = _each(table, FAMILY, statistic)
-    return ", ".join(f"{method} {value:.2f}" for method, value in zip(FAMILY, values, strict=True))
