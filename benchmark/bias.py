@@ -78,6 +78,13 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         parser.error(
             f"argument --episode-steps: {args.episode_steps} must be at least {horizon(args.gamma)}, so that a return is known"
         )
+    if args.steps < max(args.interval, args.learning_starts + 1):
+        parser.error(
+            f"argument --steps: {args.steps} must be at least --interval {args.interval} and more than --learning-starts "
+            f"{args.learning_starts}, so that something is measured"
+        )
+    if min(args.seeds) < 0:
+        parser.error(f"argument --seeds: {min(args.seeds)} must be at least 0")
     try:
         check_settings(args)
     except ValueError as error:

@@ -86,7 +86,7 @@ class CGP(
         are float32 in any case.
     :param cuda_graphs: on a GPU, whether gradient steps and CEM's acting are recorded as CUDA graphs, and the replay buffer
         is kept on the GPU: the same computation in less time. A graph fixes the Python decisions of a user's own selector.
-        Has no effect on a CPU, nor with ``Dict`` observations or another optimizer than the fused Adam.
+        Has no effect on a CPU, nor with other observations than ``Box`` or another optimizer than the fused Adam.
     :param policy_loss: the actor's loss: "cgp" imitates CEM, "qgp" follows the critic's gradient,
         None trains no actor, so that CEM acts at inference too
     :param policy_training: "online" trains the actor along with the critics, "offline" at the end of ``learn``

@@ -54,6 +54,20 @@ def test_command_refuses_episodes_too_short_for_a_return(tmp_path, capsys):
     assert "458 must be at least 459" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--steps 150 --interval 200", "argument --steps: 150 must be at least --interval 200"),
+        ("--steps 100 --interval 10 --learning-starts 100", "and more than --learning-starts 100"),
+        ("--seeds 0 -1", "argument --seeds: -1 must be at least 0"),
+    ],
+)
+def test_command_refuses_what_measures_nothing_or_cannot_train(options, message, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        command.main([*TINY, "--folder", str(tmp_path), *options.split()])
+    assert message in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("gamma", ["1", "0", "nan", "much"])
 def test_command_refuses_a_discount_without_a_horizon(gamma, tmp_path, capsys):
     with pytest.raises(SystemExit):

@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_cgp import CEM, CGPPolicy
+from sb3_cgp.core.losses import POLICY_LOSSES
 from sb3_cgp.population import Population, evaluate_population
 
 
@@ -32,6 +33,7 @@ from sb3_cgp.population import Population, evaluate_population
         (lambda: make([dict(), dict(learning_rate="fast")]), "learning_rate"),
         (lambda: make([dict(), dict(policy_delay=0)]), "policy_delay"),
         (lambda: make(2, policy_loss="huber"), "policy_loss"),
+        (lambda: make(2, policy_loss="mine"), "policy_loss"),
         (lambda: make(3, env=make_env(2)), "env.num_envs"),
         (lambda: make(2, train_freq=(1, "episode")), "train_freq"),
         (lambda: make(2, cem_dtype="bfloat16"), "cem_dtype"),
@@ -59,7 +61,9 @@ from sb3_cgp.population import Population, evaluate_population
         (lambda: evaluate_population(make(3), make_env(2)), "env.num_envs"),
     ],
 )
-def test_what_is_not_possible_is_refused_by_name(make_it, name):
+def test_what_is_not_possible_is_refused_by_name(make_it, name, monkeypatch):
+    # A loss of the user's own, which a population would not compute
+    monkeypatch.setitem(POLICY_LOSSES, "mine", lambda policy, observations: policy.actor(observations).square().mean())
     with pytest.raises(ValueError, match="must be") as error:
         make_it()
     assert f"`{name}`" in str(error.value)

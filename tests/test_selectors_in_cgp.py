@@ -9,7 +9,7 @@ from scores import Seen
 from torch import nn
 
 import sb3_cgp.core.policies as core_policies
-from sb3_cgp import CEM, CGP, MlpPolicy
+from sb3_cgp import CEM, CGP, MlpPolicy, Selection
 from sb3_cgp.fast.scoring import q_score
 from sb3_cgp.selectors import MPPI, ActorCEM, ActorOnly, ActorStart
 
@@ -120,6 +120,22 @@ def test_offline_the_prior_alone_serves_until_the_actor_is_trained(monkeypatch):
     assert all(given[first:])
     assert len(given) - first == model.actor.optimizer.state[next(model.actor.parameters())]["step"]
     assert model.policy.actor_proposes
+
+
+@pytest.mark.parametrize("arguments", [dict(policy_training="offline"), dict(policy_loss=None)])
+def test_a_selector_of_the_users_own_may_require_proposals(arguments):
+    """None without a trained actor, as the documentation of selectors says."""
+
+    class Own:
+        takes_proposals = True
+
+        def select(self, score, n_states, action_dim, device, proposals):
+            assert proposals is None
+            actions = th.zeros(n_states, action_dim, device=device)
+            return Selection(actions, actions.unsqueeze(1))
+
+    model = make_model(**arguments, policy_kwargs=dict(net_arch=[8], selector=Own()))
+    assert not model.policy.select_actions(th.rand(2, 3), model.critic).actions.any()
 
 
 def test_a_models_setting_is_saved_and_a_policys_too(tmp_path):

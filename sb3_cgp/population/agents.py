@@ -148,6 +148,8 @@ def check_supported(policy: Any, arguments: Arguments) -> None:
     require(buffer_class is None, "replay_buffer_class", buffer_class, allowed)
     saves_memory = arguments.get("optimize_memory_usage", False)
     require(not saves_memory, "optimize_memory_usage", saves_memory, "False in a population")
+    loss = arguments.get("policy_loss", "cgp")
+    require(loss in ("cgp", "qgp", None), "policy_loss", loss, "'cgp', 'qgp' or None in a population")
     dtype = arguments.get("cem_dtype", "auto")
     require(dtype != "bfloat16", "cem_dtype", dtype, "'auto' or 'float32' in a population, which scores in float32")
 

@@ -35,10 +35,12 @@ class CGPPolicy(policies.CGPPolicy):
 
         :param observation: a batch of B observations, as tensors
         :param critic: the critic, or the target critic
-        :return: ``proposals``, (B, 1, A), or nothing
+        :return: ``proposals``, (B, 1, A), or None while no actor is trained; nothing for other selectors
         """
-        if not self.actor_proposes or not takes_proposals(self.selector):
+        if not takes_proposals(self.selector):
             return {}
+        if not self.actor_proposes:
+            return {"proposals": None}
         actor = self.actor_target if critic is self.critic_target else self.actor
         with evaluation_mode(actor):
             return {"proposals": actor(observation).unsqueeze(1)}
