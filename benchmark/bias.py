@@ -78,10 +78,11 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         parser.error(
             f"argument --episode-steps: {args.episode_steps} must be at least {horizon(args.gamma)}, so that a return is known"
         )
-    if args.steps < max(args.interval, args.learning_starts + 1):
+    last = args.steps // args.interval * args.interval
+    if last <= args.learning_starts:
         parser.error(
-            f"argument --steps: {args.steps} must be at least --interval {args.interval} and more than --learning-starts "
-            f"{args.learning_starts}, so that something is measured"
+            f"argument --interval: {args.interval} must have a multiple above --learning-starts, {args.learning_starts}, and "
+            f"not above --steps, {args.steps}, so that something is measured"
         )
     if min(args.seeds) < 0:
         parser.error(f"argument --seeds: {min(args.seeds)} must be at least 0")

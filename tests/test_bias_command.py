@@ -57,8 +57,15 @@ def test_command_refuses_episodes_too_short_for_a_return(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("--steps 150 --interval 200", "argument --steps: 150 must be at least --interval 200"),
-        ("--steps 100 --interval 10 --learning-starts 100", "and more than --learning-starts 100"),
+        (
+            "--steps 150 --interval 200",
+            "--interval: 200 must have a multiple above --learning-starts, 10, and not above --steps",
+        ),
+        (
+            "--steps 150 --interval 100 --learning-starts 120",
+            "--interval: 100 must have a multiple above --learning-starts, 120",
+        ),
+        ("--steps 100 --interval 10 --learning-starts 100", "not above --steps, 100, so that something is measured"),
         ("--seeds 0 -1", "argument --seeds: -1 must be at least 0"),
     ],
 )
