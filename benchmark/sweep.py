@@ -16,7 +16,7 @@ if __name__ == "__main__":
     # At once: the imports below take seconds
     refuse_unknown_sweep(sys.argv[1:])
 
-from benchmark.common.arguments import add_epilog, count, hyperparameter, output_folder
+from benchmark.common.arguments import add_epilog, add_hyperparameters, count, output_folder
 from benchmark.reporting.figures import FOLDER, figures, study_folders
 from benchmark.sweeps.checks import check_values
 from benchmark.sweeps.execution import execute
@@ -59,15 +59,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--steps", type=count, help="environment steps of each run, in place of the file's")
     parser.add_argument("--seeds", type=count, help="number of seeds, from 0, in place of the file's")
     parser.add_argument("--methods", nargs="+", help="methods of the file to train (default: all)")
-    parser.add_argument(
-        "--set",
-        nargs="+",
-        action="extend",
-        type=hyperparameter,
-        default=[],
-        metavar="NAME=VALUE",
-        help="hyperparameters of all methods",
-    )
+    add_hyperparameters(parser, "hyperparameters of all methods")
     parser.add_argument(
         "--eval-interval",
         type=count,

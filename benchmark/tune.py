@@ -15,7 +15,7 @@ import optuna
 import torch as th
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
-from benchmark.common.arguments import add_epilog, count, hyperparameter
+from benchmark.common.arguments import add_epilog, add_hyperparameters, count
 from benchmark.common.environments import import_packages, registered_environment, split_env_id
 from benchmark.common.zoo import shortened_warm_up, warm_up_in_words
 from benchmark.sweeps.checks import check_tuning
@@ -67,15 +67,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         "--pruner", choices=sorted(PRUNERS), default="median", help="rule for giving a configuration up (default: %(default)s)"
     )
     parser.add_argument("--conf-file", help="YAML file of the entry that configurations start from (default: the algorithm's)")
-    parser.add_argument(
-        "--set",
-        nargs="+",
-        action="extend",
-        type=hyperparameter,
-        default=[],
-        metavar="NAME=VALUE",
-        help="hyperparameters that replace sampled ones",
-    )
+    add_hyperparameters(parser, "hyperparameters that replace sampled ones")
     parser.add_argument("--eval-interval", type=count, help="environment steps between two evaluations")
     parser.add_argument("--eval-episodes", type=count, default=5, help="episodes of each (default: %(default)s)")
     parser.add_argument("--write", type=Path, help="a YAML file of rl_zoo3's, for the best configuration")

@@ -9,9 +9,10 @@ import yaml
 from optuna.trial import TrialState, create_trial
 
 from benchmark import tune, worker
+from benchmark.common.arguments import hyperparameter
 from benchmark.common.provenance import machine, processor
 from benchmark.common.records import STUDY, Record, read_records, write_records
-from benchmark.sweep import hyperparameter, load, main, parse
+from benchmark.sweep import load, main, parse
 from benchmark.sweeps.checks import check_values
 from benchmark.sweeps.execution import describe
 from benchmark.sweeps.experiments import load_sweep, study_name

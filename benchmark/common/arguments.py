@@ -98,6 +98,16 @@ def hyperparameter(text: str) -> tuple[str, Any]:
         return name, read
 
 
+def add_hyperparameters(parser: argparse.ArgumentParser, text: str) -> None:
+    """
+    Add the argument that sets hyperparameters, which may be given several times.
+
+    :param parser: the command's parser
+    :param text: the argument's help
+    """
+    parser.add_argument("--set", nargs="+", action="extend", type=hyperparameter, default=[], metavar="NAME=VALUE", help=text)
+
+
 def output_folder(text: str) -> Path:
     """
     Read the path of a folder, and create it at once, so that no measurement ends without a folder for its results.

@@ -75,8 +75,7 @@ def _method(
     (look,) = styles([method]).values()
     floor, grid = floors(study.records)[task], evaluation_grid(study.records, task)
     lines = curves(runs, floor, grid)
-    planned = study.planned_seeds(method)
-    name = method if len(runs) >= planned else f"{method} ({len(runs)} of {planned} seeds)"
+    name = study.label(method, len(runs))
 
     def trace(kind: str, y: np.ndarray, is_timed: bool, **options: Any) -> Trace:
         minutes = grid * minutes_per_step if minutes_per_step is not None and is_timed else np.array([])

@@ -158,14 +158,14 @@ def _figure(
         if len(grid) == 0:
             continue
         if not is_alone:
-            panel.set_title(_label(study, method, runs).replace(" (", "\n("))
+            panel.set_title(study.label(method, len(runs)).replace(" (", "\n("))
             if method != reference:
                 beside = interquartile_mean(lines[reference][None])[0]
                 panel.plot(grid * units_per_step[reference], beside, label=f"{reference}, in all panels", **BESIDE)
         draw_seeds(panel, x, lines[method], looks[method]["color"])
         middle, interval = bootstrap(interquartile_mean, [[lines[method]]], repetitions)
         label, look = (
-            (_label(study, method, runs), looks[method]) if is_alone else ("_method", looks[method] | {"linestyle": "-"})
+            (study.label(method, len(runs)), looks[method]) if is_alone else ("_method", looks[method] | {"linestyle": "-"})
         )
         draw_line(panel, x, middle, label, look)
         if interval is not None:
@@ -219,9 +219,3 @@ def _mark(panel: Axes, entry: Published) -> None:
     steps, means = list(entry.returns), [mean for mean, _ in entry.returns.values()]
     marks = dict(look, linestyle="none", markerfacecolor="none", markersize=9, markeredgewidth=1.8, clip_on=False)
     panel.plot(steps, means, label=f"{entry.method}, literature, {entry.version}", **marks)
-
-
-def _label(study: Study, method: str, runs: Sequence[Record]) -> str:
-    """Return a method's name, with the number of its runs where some of its seeds are missing."""
-    planned = study.planned_seeds(method)
-    return method if len(runs) >= planned else f"{method} ({len(runs)} of {planned} seeds)"

@@ -56,6 +56,17 @@ class Study:
         """
         return self.facts.get("seeds_of_methods", {}).get(method, len(self.facts["seeds"]))
 
+    def label(self, method: str, n_runs: int) -> str:
+        """
+        Return a method's name for a legend, with the number of its runs where some of its seeds are missing.
+
+        :param method: the method
+        :param n_runs: number of its runs
+        :return: the name
+        """
+        planned = self.planned_seeds(method)
+        return method if n_runs >= planned else f"{method} ({n_runs} of {planned} seeds)"
+
     @cached_property
     def axes(self) -> dict[str, list[Any]]:
         """The values of each axis that some run has, the planned ones first."""
