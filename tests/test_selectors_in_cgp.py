@@ -16,9 +16,16 @@ from sb3_cgp.selectors import MPPI, ActorCEM, ActorOnly, ActorStart
 LIGHT = dict(cem_start="actor", cem_iterations=1, cem_samples=16)
 
 
-def make_model(**kwargs):
+class WithSelector(MlpPolicy):
+    """A policy class of a user's, with a selector of its own."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **(dict(selector=CEM(1, 8, 4)) | kwargs))
+
+
+def make_model(policy="MlpPolicy", **kwargs):
     arguments = dict(learning_starts=50, buffer_size=1_000, batch_size=16, seed=0, policy_kwargs=dict(net_arch=[16]))
-    return CGP("MlpPolicy", "Pendulum-v1", **(arguments | kwargs))
+    return CGP(policy, "Pendulum-v1", **(arguments | kwargs))
 
 
 @pytest.mark.parametrize(
@@ -37,6 +44,11 @@ def make_model(**kwargs):
         (lambda: make_model(cem_start="actor", cem_actor_std=math.inf), "cem_actor_std"),
         (lambda: make_model(cem_start="actor", policy_loss=None), "cem_start"),
         (lambda: make_model(cem_start="actor", policy_kwargs=dict(selector=CEM())), "cem_start"),
+        (lambda: make_model(cem_start="actor", policy=WithSelector), "cem_start"),
+        (lambda: make_model(cem_start="actor", cem_samples=1, cem_elites=1), "cem_samples"),
+        (lambda: make_model(**LIGHT, cem_actor_fraction=1.0, cem_actor_std=0.0), "cem_actor_std"),
+        # 15.2 samples, rounded: all but the actor's action itself
+        (lambda: make_model(**LIGHT, cem_actor_fraction=0.95, cem_actor_std=0.0), "cem_actor_std"),
         (lambda: make_model(policy_kwargs=dict(actor_proposes=True)), "policy_kwargs['actor_proposes']"),
         (lambda: make_model(policy_kwargs=dict(selector=ActorOnly())), "policy_loss"),
         (lambda: make_model(policy_loss=None, policy_kwargs=dict(selector=ActorOnly())), "policy_loss"),
@@ -52,6 +64,24 @@ def test_wrong_arguments_are_refused_by_name(make, name):
     with pytest.raises(ValueError, match="must be") as error:
         make()
     assert f"`{name}`" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        dict(policy_loss="qgp", cem_samples=1, cem_elites=1),
+        dict(policy_loss="qgp", cem_actor_fraction=1.0, cem_actor_std=0.0),
+        dict(cem_samples=2, cem_elites=1),
+        dict(LIGHT, cem_actor_fraction=1.0, cem_actor_std=0.1),
+        # 14.4 samples, rounded: one of the prior is left
+        dict(LIGHT, cem_actor_fraction=0.9, cem_actor_std=0.0),
+    ],
+)
+def test_a_search_near_the_actor_is_accepted_where_the_actor_can_learn(arguments):
+    model = make_model(**(dict(cem_start="actor", diagnostics=False) | arguments))
+    before = [parameter.clone() for parameter in model.actor.parameters()]
+    model.learn(60)
+    assert any(not th.equal(*pair) for pair in zip(before, model.actor.parameters(), strict=True))
 
 
 def record_proposals(model):

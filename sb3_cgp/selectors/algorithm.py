@@ -6,7 +6,7 @@ from sb3_cgp.core.cgp import CGP
 from sb3_cgp.selectors.actor_cem import ActorCEM
 from sb3_cgp.selectors.actor_only import ActorOnly
 from sb3_cgp.selectors.policies import CGPPolicy
-from sb3_cgp.selectors.proposals import check_start, takes_proposals
+from sb3_cgp.selectors.proposals import ActorStart, check_start, takes_proposals
 
 STARTS = ("prior", "actor")
 
@@ -32,9 +32,12 @@ class SelectorAlgorithm(CGP):
         if self.cem_start == "actor":
             allowed = "'prior' where `policy_loss=None` trains no actor"
             require(self.policy_loss is not None, "cem_start", self.cem_start, allowed)
-            allowed = "'prior' with another selector than CEM, such as the one in `policy_kwargs`"
-            require(self.policy_kwargs.get("selector") is None, "cem_start", self.cem_start, allowed)
+            self._check_samples()
         super()._setup_model()
+        if self.cem_start == "actor":
+            is_ours = self.policy_kwargs.get("selector") is None and isinstance(self.policy.selector, ActorCEM)
+            allowed = "'prior' with a selector of `policy_kwargs` or of the policy's class, which replaces CEM"
+            require(is_ours, "cem_start", self.cem_start, allowed)
         allowed = "a subclass of sb3_cgp.CGPPolicy, whose actor can propose actions to the selector"
         require(
             isinstance(self.policy, CGPPolicy) or not takes_proposals(self.policy.selector),
@@ -46,6 +49,16 @@ class SelectorAlgorithm(CGP):
             reason = "with the selector ActorOnly(), whose actions are the actor's own"
             require(self.policy_loss == "qgp", "policy_loss", self.policy_loss, f"'qgp' {reason}")
             require(self._trains_online, "policy_training", self.policy_training, f"'online' {reason}")
+
+    def _check_samples(self) -> None:
+        """Refuse samples that are all the actor's action: an actor that imitates itself learns nothing."""
+        if self.policy_loss == "cgp":
+            reason = "with cem_start='actor' and policy_loss='cgp', as an actor that imitates itself learns nothing"
+            require(self.cem_samples > 1, "cem_samples", self.cem_samples, f"at least 2 {reason}")
+            start = ActorStart(self.cem_actor_fraction, self.cem_actor_std)
+            has_others = self.cem_actor_std > 0 or start.n_around(self.cem_samples) < self.cem_samples - 1
+            allowed = f"greater than 0, or `cem_actor_fraction` smaller, {reason}"
+            require(has_others, "cem_actor_std", self.cem_actor_std, allowed)
 
     def _make_selector(self) -> ActionSelector:
         if self.cem_start == "prior":

@@ -59,6 +59,16 @@ class ActorStart:
     def __post_init__(self) -> None:
         check_start(self.fraction, self.std)
 
+    def n_around(self, n_samples: int, n_proposals: int = 1) -> int:
+        """
+        Return how many samples are drawn around the proposals.
+
+        :param n_samples: number of samples, N
+        :param n_proposals: number of proposals among them, P
+        :return: ``fraction`` of the samples, rounded, but for those that are proposals
+        """
+        return min(round(self.fraction * n_samples), n_samples - n_proposals)
+
     def move(self, samples: th.Tensor, proposals: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         Make first samples from standard normal ones.
@@ -70,7 +80,7 @@ class ActorStart:
         """
         proposals = proposals[:, : samples.shape[1]]
         n_proposals = proposals.shape[1]
-        n_around = min(round(self.fraction * samples.shape[1]), samples.shape[1] - n_proposals)
+        n_around = self.n_around(samples.shape[1], n_proposals)
         centres = before_tanh(proposals)
         samples[:, :n_proposals] = centres
         if n_proposals > 1:
