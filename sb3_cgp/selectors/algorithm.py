@@ -6,7 +6,7 @@ from sb3_cgp.core.cgp import CGP
 from sb3_cgp.selectors.actor_cem import ActorCEM
 from sb3_cgp.selectors.actor_only import ActorOnly
 from sb3_cgp.selectors.policies import CGPPolicy
-from sb3_cgp.selectors.proposals import ActorStart, check_start, takes_proposals
+from sb3_cgp.selectors.proposals import check_start, takes_proposals
 
 STARTS = ("prior", "actor")
 
@@ -29,15 +29,9 @@ class SelectorAlgorithm(CGP):
         check_start(self.cem_actor_fraction, self.cem_actor_std, prefix="cem_actor_")
         given = self.policy_kwargs.get("actor_proposes")
         require(given is None, "policy_kwargs['actor_proposes']", given, "left out: CGP sets it when the actor is trained")
-        if self.cem_start == "actor":
-            allowed = "'prior' where `policy_loss=None` trains no actor"
-            require(self.policy_loss is not None, "cem_start", self.cem_start, allowed)
-            self._check_samples()
         super()._setup_model()
         if self.cem_start == "actor":
-            is_ours = self.policy_kwargs.get("selector") is None and isinstance(self.policy.selector, ActorCEM)
-            allowed = "'prior' with a selector of `policy_kwargs` or of the policy's class, which replaces CEM"
-            require(is_ours, "cem_start", self.cem_start, allowed)
+            self._check_actor_start()
         allowed = "a subclass of sb3_cgp.CGPPolicy, whose actor can propose actions to the selector"
         require(
             isinstance(self.policy, CGPPolicy) or not takes_proposals(self.policy.selector),
@@ -50,13 +44,19 @@ class SelectorAlgorithm(CGP):
             require(self.policy_loss == "qgp", "policy_loss", self.policy_loss, f"'qgp' {reason}")
             require(self._trains_online, "policy_training", self.policy_training, f"'online' {reason}")
 
-    def _check_samples(self) -> None:
-        """Refuse samples that are all the actor's action: an actor that imitates itself learns nothing."""
+    def _check_actor_start(self) -> None:
+        """Check that an actor is trained, that the selector is CEM, and that not all of its samples are the actor's action."""
+        allowed = "'prior' where `policy_loss=None` trains no actor"
+        require(self.policy_loss is not None, "cem_start", self.cem_start, allowed)
+        selector = self.policy.selector
+        is_ours = self.policy_kwargs.get("selector") is None and isinstance(selector, ActorCEM)
+        allowed = "'prior' with a selector of `policy_kwargs` or of the policy's class, which replaces CEM"
+        require(is_ours, "cem_start", self.cem_start, allowed)
+        assert isinstance(selector, ActorCEM)
         if self.policy_loss == "cgp":
             reason = "with cem_start='actor' and policy_loss='cgp', as an actor that imitates itself learns nothing"
             require(self.cem_samples > 1, "cem_samples", self.cem_samples, f"at least 2 {reason}")
-            start = ActorStart(self.cem_actor_fraction, self.cem_actor_std)
-            has_others = self.cem_actor_std > 0 or start.n_around(self.cem_samples) < self.cem_samples - 1
+            has_others = self.cem_actor_std > 0 or selector.start.n_around(self.cem_samples) < self.cem_samples - 1
             allowed = f"greater than 0, or `cem_actor_fraction` smaller, {reason}"
             require(has_others, "cem_actor_std", self.cem_actor_std, allowed)
 
