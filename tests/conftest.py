@@ -5,6 +5,7 @@ import shutil
 import signal
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 import torch as th
 
@@ -60,6 +61,12 @@ def heeds_interruptions():
 def short_policy_training(monkeypatch):
     """Rounds of 10 steps, so that offline training takes a moment."""
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
+
+
+@pytest.fixture
+def short_episodes(monkeypatch):
+    """End Pendulum-v1's episodes after 25 steps rather than 200: evaluations are most of a tiny training's time otherwise."""
+    monkeypatch.setattr(gym.spec("Pendulum-v1"), "max_episode_steps", 25)
 
 
 @pytest.fixture

@@ -25,6 +25,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_cgp import CGP, HParamsCallback, TrainingCheckpointCallback
 from sb3_cgp.resumption.fingerprints import fingerprint
 
+pytestmark = pytest.mark.usefixtures("short_episodes")
+
 TINY = dict(learning_starts=5, batch_size=4, buffer_size=300, policy_kwargs=dict(net_arch=[4]), device="cpu", seed=0)
 
 
@@ -92,7 +94,7 @@ class Keeping(BaseCallback):
         return True
 
 
-def missing(callback, folder, steps=220, **arguments):
+def missing(callback, folder, steps=60, **arguments):
     """Resume a training without a callback that the first part had; return the warnings about it."""
     model = CGP("MlpPolicy", "Pendulum-v1", **TINY, **arguments)
     model.learn(steps, callback=[TrainingCheckpointCallback(min(steps, 20), folder), callback])
@@ -123,10 +125,10 @@ def test_a_callback_that_has_counted_nothing_is_not_missed(callback, tmp_path):
     if isinstance(callback, StopTrainingOnMaxEpisodes):
         # No episode has ended when the state is saved
         model = CGP("MlpPolicy", "Pendulum-v1", **TINY)
-        model.learn(40, callback=[TrainingCheckpointCallback(20, tmp_path), callback])
+        model.learn(24, callback=[TrainingCheckpointCallback(12, tmp_path), callback])
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            CGP.resume(tmp_path, "Pendulum-v1").learn(60)
+            CGP.resume(tmp_path, "Pendulum-v1").learn(40)
         return
     assert missing(callback, tmp_path) == []
 
@@ -134,11 +136,11 @@ def test_a_callback_that_has_counted_nothing_is_not_missed(callback, tmp_path):
 @pytest.mark.parametrize(
     "callback",
     [
-        Watch(counts_from=100),
+        Watch(counts_from=30),
         Declaring({"seen": 3}),
         EveryNTimesteps(7, HParamsCallback()),
         StopTrainingOnMaxEpisodes(99),
-        EvalCallback(make_vec_env("Pendulum-v1"), eval_freq=100, n_eval_episodes=1, verbose=0),
+        EvalCallback(make_vec_env("Pendulum-v1"), eval_freq=30, n_eval_episodes=1, verbose=0),
     ],
     ids=lambda each: type(each).__name__,
 )
@@ -181,7 +183,7 @@ def test_what_a_callback_counts_in_any_object_is_missed(kept, count, tmp_path):
 def test_what_was_counted_before_the_offline_training_of_a_policy_counts(tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
     # Its value does not change in the training of the policy, which begins the callbacks anew
-    assert len(missing(Watch(counts_from=220), tmp_path, policy_training="offline")) == 1
+    assert len(missing(Watch(counts_from=60), tmp_path, policy_training="offline")) == 1
 
 
 def test_what_was_counted_before_a_resumption_counts(tmp_path):

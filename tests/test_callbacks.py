@@ -21,6 +21,8 @@ from sb3_cgp.resumption import TrainingCheckpointCallback
 from sb3_cgp.resumption.signals import StopSignals
 from sb3_cgp.resumption.store import StateStore
 
+pytestmark = pytest.mark.usefixtures("short_episodes")
+
 SIGNALS = [(signal.SIGTERM, SystemExit, "143"), (signal.SIGINT, KeyboardInterrupt, "its state of step 40")]
 
 
@@ -395,15 +397,15 @@ def test_in_another_thread_states_are_saved_and_signals_left_alone(tmp_path):
 def test_tensorboard_goes_on_in_the_trainings_own_folder(tmp_path):
     logs = str(tmp_path / "logs")
     arguments = dict(env="Pendulum-v1", tensorboard_log=logs)
-    make_model(**arguments).learn(800, log_interval=1)
-    stop = Do(690, lambda: 1 / 0)
+    make_model(**arguments).learn(100, log_interval=1)
+    stop = Do(86, lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        make_model(**arguments).learn(800, [TrainingCheckpointCallback(210, tmp_path / "state"), stop], log_interval=1)
+        make_model(**arguments).learn(100, [TrainingCheckpointCallback(26, tmp_path / "state"), stop], log_interval=1)
     # The newest folder is another's
     make_model(**arguments).learn(30)
     # TensorBoard puts a folder's files into the order of the second in their names
     time.sleep(1)
-    model = CGP.resume(tmp_path / "state", "Pendulum-v1").learn(800, log_interval=1)
+    model = CGP.resume(tmp_path / "state", "Pendulum-v1").learn(100, log_interval=1)
     assert model.logger.dir == f"{logs}/CGP_2"
     curves = []
     for name in ("CGP_1", "CGP_2"):
@@ -413,4 +415,4 @@ def test_tensorboard_goes_on_in_the_trainings_own_folder(tmp_path):
     assert curves[0] == curves[1]
     assert len(curves[0]["rollout/ep_rew_mean"]) == 4
     # A training after it has a folder of its own
-    assert model.learn(200, log_interval=1).logger.dir == f"{logs}/CGP_4"
+    assert model.learn(25, log_interval=1).logger.dir == f"{logs}/CGP_4"

@@ -51,9 +51,10 @@ except ImportError:
 sys.exit("nothing is blocked")
 """
 TRAINING = """
-model = CGP("MlpPolicy", policy_kwargs=dict(net_arch=[16, 16]), **{arguments!r}, **{variant!r}).learn(150)
-th.save(model.policy.state_dict(), {path!r})
-assert model._n_updates == 100
+for name, variant in {variants!r}.items():
+    model = CGP("MlpPolicy", policy_kwargs=dict(net_arch=[16, 16]), **{arguments!r}, **variant).learn(150)
+    th.save(model.policy.state_dict(), {folder!r} + f"/{{name}}.pt")
+    assert model._n_updates == 100
 """
 LEARNING = """
 from stable_baselines3.common.env_util import make_vec_env
@@ -74,13 +75,18 @@ def run_alone(training):
     return subprocess.run([sys.executable, "-c", script], check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
+@pytest.fixture(scope="module")
+def trained_alone(tmp_path_factory):
+    """What the core alone has learnt, by variant."""
+    folder = tmp_path_factory.mktemp("alone")
+    run_alone(TRAINING.format(arguments=ARGUMENTS, variants=VARIANTS, folder=str(folder)))
+    return {variant: th.load(folder / f"{variant}.pt") for variant in VARIANTS}
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_the_core_trains_without_any_wing_as_the_whole_package_does(variant, tmp_path):
+def test_the_core_trains_without_any_wing_as_the_whole_package_does(variant, trained_alone):
     assert {"algorithm", "fast", "guards", "resumption", "export", "zoo", "diagnostics"} <= set(WINGS)
-    path = str(tmp_path / "policy.pt")
-    kwargs = VARIANTS[variant]
-    run_alone(TRAINING.format(arguments=ARGUMENTS, variant=kwargs, path=path))
-    alone = th.load(path)
+    alone, kwargs = trained_alone[variant], VARIANTS[variant]
     assert alone
 
     # With the core's own networks and scoring, the wings change no bit

@@ -15,6 +15,8 @@ from trainings import Training, assert_same, fingerprint
 
 from sb3_cgp import CGP
 
+pytestmark = pytest.mark.usefixtures("short_episodes")
+
 SAVE_FREQ = 20
 STEPS = 1_000
 

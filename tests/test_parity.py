@@ -49,11 +49,12 @@ def test_several_environments_at_once(vec_env_class):
 
 @pytest.mark.parametrize(
     ("train_freq", "gradient_steps", "n_updates"),
-    [((1, "episode"), -1, 400), ((1, "episode"), 7, 14), (4, 1, 90), ((5, "step"), -1, 360), (1, 0, 0), (1, 3, 1080)],
+    [((1, "episode"), -1, 75), ((1, "episode"), 7, 21), (4, 1, 15), ((5, "step"), -1, 60), (1, 0, 0), (1, 3, 180)],
 )
+@pytest.mark.usefixtures("short_episodes")
 def test_training_frequencies(train_freq, gradient_steps, n_updates):
     model = make_model(train_freq=train_freq, gradient_steps=gradient_steps)
-    model.learn(400)
+    model.learn(100)
     assert model._n_updates == n_updates
 
 

@@ -88,14 +88,14 @@ def alone_like(population, index):
 def test_an_agent_computes_what_a_cgp_alone_computes(variant, float64, monkeypatch):
     kwargs = VARIANTS[variant]
     agents = [own | {name: kwargs[name] for name in ("policy_delay",) if name in kwargs and own} for own in AGENTS]
-    population = make(agents, gradient_steps=5, **kwargs)
+    population = make(agents, gradient_steps=2, **kwargs)
     initial = [{name: value.clone() for name, value in agent.policy.state_dict().items()} for agent in population]
     steps = record(population, monkeypatch)
     # Offline training comes after the gradient steps that are compared here
     monkeypatch.setattr(population, "_train_policies", lambda: None)
     population.learn(3 * 63)
-    assert len(steps) == 5 * 43
-    assert list(population._agent_updates) == [5 * 43, 5 * 41, 5 * 43]
+    assert len(steps) == 2 * 43
+    assert list(population._agent_updates) == [2 * 43, 2 * 41, 2 * 43]
     for index, agent in enumerate(population):
         alone = alone_like(population, index)
         assert all(th.equal(initial[index][name], value) for name, value in alone.policy.state_dict().items())
@@ -110,7 +110,7 @@ def test_an_agent_computes_what_a_cgp_alone_computes(variant, float64, monkeypat
 
 @pytest.mark.parametrize("variant", ["CGP", "TD3"])
 def test_an_agent_is_a_cgp_alone_in_single_precision_too(variant, monkeypatch):
-    population = make(AGENTS, gradient_steps=5, **VARIANTS[variant])
+    population = make(AGENTS, gradient_steps=2, **VARIANTS[variant])
     steps = record(population, monkeypatch)
     population.learn(3 * 63)
     for index, agent in enumerate(population):
@@ -132,11 +132,11 @@ def test_a_population_of_one_is_a_cgp_alone_from_the_first_step(variant, env, fl
     noise = NormalActionNoise(np.zeros(env.action_space.shape), 0.1 * np.ones(env.action_space.shape))
     # A gamma that is exact in single precision, to which the core rounds it
     kwargs = VARIANTS[variant] | dict(action_noise=noise, gamma=0.5)
-    population = make(1, make_env(1, env), **kwargs).learn(230)
-    alone = CGP("MlpPolicy", make_env(1, env), **population.agents[0], device="cpu").learn(230)
-    assert alone._n_updates == 210
-    np.testing.assert_allclose(population.replay_buffer.actions[:230], alone.replay_buffer.actions[:230], atol=1e-4)
-    np.testing.assert_array_equal(population.replay_buffer.observations[:230], alone.replay_buffer.observations[:230])
+    population = make(1, make_env(1, env), **kwargs).learn(110)
+    alone = CGP("MlpPolicy", make_env(1, env), **population.agents[0], device="cpu").learn(110)
+    assert alone._n_updates == 90
+    np.testing.assert_allclose(population.replay_buffer.actions[:110], alone.replay_buffer.actions[:110], atol=1e-4)
+    np.testing.assert_array_equal(population.replay_buffer.observations[:110], alone.replay_buffer.observations[:110])
     # Buffers round to single precision, and MPPI magnifies that
     assert_alike(population[0], alone, rtol=1e-3, atol=1e-4)
 

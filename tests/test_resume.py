@@ -5,6 +5,7 @@ import random
 import signal
 import subprocess
 import sys
+import time
 import warnings
 
 import gymnasium as gym
@@ -25,6 +26,10 @@ from trainings import SMALL, Interruption, Stop, Training, assert_same, fingerpr
 from sb3_cgp import CGP
 from sb3_cgp.resumption import TrainingCheckpointCallback
 from sb3_cgp.resumption.algorithm import resumable
+from sb3_cgp.resumption.store import StateStore
+
+
+pytestmark = pytest.mark.usefixtures("short_episodes")
 
 
 class Images(Doubles):
@@ -105,7 +110,8 @@ def short_policy_training(monkeypatch):
 
 
 def straight(folder, case, **arguments):
-    training = Training(folder / "straight", **CASES[case], **arguments)
+    """Train without an interruption, saving no state but the last."""
+    training = Training(folder / "straight", **(CASES[case] | arguments | dict(save_freq=10_000)))
     return training, fingerprint(training, training.run())
 
 
@@ -144,7 +150,7 @@ def stopped_anywhere(folder, case, stops, save_freq):
     assert_same(fingerprint(resumed, resumed.run(*stops)), expected)
 
 
-@settings(UNHURRIED, max_examples=5)
+@settings(UNHURRIED, max_examples=3)
 @any_stops
 def test_wherever_it_was_stopped(tmp_path_factory, case, stops, save_freq):
     stopped_anywhere(tmp_path_factory.mktemp("training"), case, stops, save_freq)
@@ -355,10 +361,11 @@ def test_callbacks_keep_their_new_arguments_and_their_old_counters(tmp_path):
 
 
 SCRIPT = """
-import sys, numpy as np
+import sys, gymnasium, numpy as np
 from sb3_cgp import CGP
 from trainings import Training, fingerprint
-training = Training(sys.argv[1], normalises=True, steps=int(sys.argv[2]), save_freq=25)
+gymnasium.spec("Pendulum-v1").max_episode_steps = 25
+training = Training(sys.argv[1], normalises=True, steps=int(sys.argv[2]), save_freq=25, eval_freq=200)
 state = training.folder / "state"
 if list(state.glob("state-*.json")):
     model = CGP.resume(state, training.make_env(7))
@@ -374,25 +381,23 @@ def process(folder, steps):
     return subprocess.Popen([sys.executable, "-c", SCRIPT, str(folder), str(steps)], stdout=subprocess.PIPE, env=environment)
 
 
-def result(folder):
-    with np.load(folder / "result.npz") as found:
-        return dict(found)
+def wait_for_state(folder, beyond):
+    while max(StateStore(folder / "state").steps(), default=0) <= beyond:
+        time.sleep(0.01)
 
 
-def wait_for_state(folder):
-    while not list((folder / "state").glob("state-*.json")):
-        pass
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_stopped_processes_go_on_in_new_ones(tmp_path, number):
-    steps = 600
-    straight = process(tmp_path / "straight", steps)
-    stopped = process(tmp_path / "stopped", steps)
-    wait_for_state(tmp_path / "stopped")
-    stopped.send_signal(number)
-    assert stopped.wait() == (143 if number == signal.SIGTERM else -9)
-    assert not (tmp_path / "stopped" / "result.npz").exists()
+def test_stopped_processes_go_on_in_new_ones(tmp_path):
+    steps, reached = 400, 0
+    for number, status in ((signal.SIGTERM, 143), (signal.SIGKILL, -9)):
+        stopped = process(tmp_path / "stopped", steps)
+        wait_for_state(tmp_path / "stopped", reached)
+        stopped.send_signal(number)
+        assert stopped.wait() == status
+        assert not (tmp_path / "stopped" / "result.npz").exists()
+        reached = max(StateStore(tmp_path / "stopped" / "state").steps())
+        assert 0 < reached < steps
     assert process(tmp_path / "stopped", steps).wait() == 0
-    assert straight.wait() == 0
-    assert_same(result(tmp_path / "stopped"), result(tmp_path / "straight"))
+    straight = Training(tmp_path / "straight", normalises=True, steps=steps, save_freq=25, eval_freq=200)
+    expected = fingerprint(straight, straight.run())
+    with np.load(tmp_path / "stopped" / "result.npz") as found:
+        assert_same(dict(found), expected)

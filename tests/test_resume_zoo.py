@@ -23,8 +23,9 @@ from sb3_cgp.zoo import registration as zoo
 from sb3_cgp.zoo.resume import main
 from sb3_cgp.zoo.run_folders import LOCK_FILE, interpreter
 
-EPISODE = 200
-CHECKPOINT = "{'sb3_cgp.TrainingCheckpointCallback': dict(save_freq=250)}"
+pytestmark = pytest.mark.usefixtures("short_episodes")
+
+CHECKPOINT = "{'sb3_cgp.TrainingCheckpointCallback': dict(save_freq=64)}"
 
 
 class Interruption(Exception):
@@ -50,10 +51,10 @@ def _uninterrupted(monkeypatch):
 
 def command(folder, *options, callbacks=CHECKPOINT, **params):
     """The command line of a small run."""
-    small = dict(learning_starts=150, buffer_size=1_000, batch_size=8, cem_samples=8, cem_elites=2, gradient_steps=1)
-    small |= dict(n_timesteps=1_300, policy_kwargs="dict(net_arch=[8])", callback=f"[{callbacks}]", train_freq=2) | params
+    small = dict(learning_starts=40, buffer_size=250, batch_size=8, cem_samples=8, cem_elites=2, gradient_steps=1)
+    small |= dict(n_timesteps=330, policy_kwargs="dict(net_arch=[8])", callback=f"[{callbacks}]", train_freq=2) | params
     arguments = f"--algo cgp --env Pendulum-v1 --seed 3 --device cpu --num-threads 1 --log-folder {folder} "
-    arguments += f"--tensorboard-log {folder}/tensorboard --eval-freq 300 --eval-episodes 2 --log-interval 1"
+    arguments += f"--tensorboard-log {folder}/tensorboard --eval-freq 76 --eval-episodes 2 --log-interval 1"
     return [*arguments.split(), *options, "-params", *(f"{name}:{value}" for name, value in small.items())]
 
 
@@ -103,11 +104,11 @@ def assert_same(found, expected):
 @pytest.mark.parametrize(
     ("options", "params", "stops"),
     [
-        ((), {}, [930]),
+        ((), {}, [230]),
         # Twice from the same state
-        ((), {}, [270, 510, 505]),
-        (("--progress", "--save-freq", "400"), {"normalize": "True", "n_envs": 2}, [330]),
-        pytest.param((), {"policy_training": "'offline'"}, [930], marks=pytest.mark.slow),
+        ((), {}, [70, 132, 129]),
+        (("--progress", "--save-freq", "100"), {"normalize": "True", "n_envs": 2}, [84]),
+        pytest.param((), {"policy_training": "'offline'"}, [230], marks=pytest.mark.slow),
     ],
     ids=["once", "thrice", "two-environments-normalised", "offline"],
 )
@@ -156,7 +157,7 @@ def test_nothing_is_left_to_do_for_a_run_that_has_ended(monkeypatch, tmp_path, c
 def test_a_run_that_the_keyboard_interrupted_goes_on_although_it_has_a_model(monkeypatch, tmp_path):
     start(monkeypatch, command(tmp_path / "straight"))
     callbacks = f"{CHECKPOINT}, 'test_resume_zoo.Stop'"
-    monkeypatch.setattr(Stop, "at", 700)
+    monkeypatch.setattr(Stop, "at", 180)
     monkeypatch.setitem(globals(), "Interruption", KeyboardInterrupt)
     start(monkeypatch, command(tmp_path / "stopped", callbacks=callbacks))
     assert (run_of(tmp_path / "stopped") / "Pendulum-v1.zip").exists()
@@ -167,10 +168,10 @@ def test_a_run_that_the_keyboard_interrupted_goes_on_although_it_has_a_model(mon
 
 def test_a_policys_training_that_the_keyboard_interrupted_goes_on(monkeypatch, tmp_path):
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
-    options = dict(policy_training="'offline'", n_timesteps=400)
+    options = dict(policy_training="'offline'", n_timesteps=100)
     start(monkeypatch, command(tmp_path / "straight", **options))
-    # Behind the environment's 400 steps, within the policy's training
-    monkeypatch.setattr(Stop, "at", 430)
+    # Behind the environment's 100 steps, within the policy's training
+    monkeypatch.setattr(Stop, "at", 110)
     monkeypatch.setitem(globals(), "Interruption", KeyboardInterrupt)
     callbacks = f"{CHECKPOINT}, 'test_resume_zoo.Stop'"
     start(monkeypatch, command(tmp_path / "stopped", callbacks=callbacks, **options))
@@ -182,15 +183,15 @@ def test_a_policys_training_that_the_keyboard_interrupted_goes_on(monkeypatch, t
 
 def test_states_in_a_folder_of_the_users_choice_are_found(monkeypatch, tmp_path, capsys):
     states = tmp_path / "states"
-    chosen = CHECKPOINT.replace("250", f"250, path='{states}'")
-    start(monkeypatch, command(tmp_path / "straight", n_timesteps=400))
-    monkeypatch.setattr(Stop, "at", 330)
+    chosen = CHECKPOINT.replace("64", f"64, path='{states}'")
+    start(monkeypatch, command(tmp_path / "straight", n_timesteps=100))
+    monkeypatch.setattr(Stop, "at", 84)
     with pytest.raises(Interruption):
-        start(monkeypatch, command(tmp_path / "stopped", callbacks=f"{chosen}, 'test_resume_zoo.Stop'", n_timesteps=400))
+        start(monkeypatch, command(tmp_path / "stopped", callbacks=f"{chosen}, 'test_resume_zoo.Stop'", n_timesteps=100))
     monkeypatch.setattr(Stop, "at", None)
     resume(run_of(tmp_path / "stopped"))
     assert not (run_of(tmp_path / "stopped") / "state").exists()
-    assert max(StateStore(states).steps()) == 400
+    assert max(StateStore(states).steps()) == 100
     assert_same(outcome(tmp_path / "stopped"), outcome(tmp_path / "straight"))
 
 
@@ -198,7 +199,7 @@ def test_what_cannot_be_resumed_is_refused_with_what_to_do(monkeypatch, tmp_path
     with pytest.raises(SystemExit, match="nowhere is no folder of a run of rl_zoo3"):
         main([str(tmp_path / "nowhere")])
     callbacks = f"{CHECKPOINT}, 'test_resume_zoo.Stop'"
-    monkeypatch.setattr(Stop, "at", 100)
+    monkeypatch.setattr(Stop, "at", 26)
     with pytest.raises(Interruption):
         start(monkeypatch, command(tmp_path, callbacks=callbacks))
     with pytest.raises(SystemExit, match=r"Error: There is no state in .*state: .* anew, by the command in .*command\.txt"):
@@ -211,7 +212,7 @@ def test_what_cannot_be_resumed_is_refused_with_what_to_do(monkeypatch, tmp_path
 
 @pytest.mark.parametrize("error", [RuntimeError, TimeoutError, ValueError])
 def test_a_state_that_cannot_be_taken_is_named_without_a_traceback(error, monkeypatch, tmp_path):
-    monkeypatch.setattr(Stop, "at", 300)
+    monkeypatch.setattr(Stop, "at", 76)
     with pytest.raises(Interruption):
         start(monkeypatch, command(tmp_path, callbacks=f"{CHECKPOINT}, 'test_resume_zoo.Stop'"))
     before = (run_of(tmp_path) / "0.monitor.csv").read_bytes()
@@ -231,20 +232,20 @@ class Beside(BaseCallback):
     folder, refused = None, None
 
     def _on_step(self):
-        if self.n_calls == 300:
+        if self.n_calls == 76:
             with pytest.raises(FolderInUseError, match=r"is in use by another training: process \d+ on host"):
                 FolderLock(Beside.folder, LOCK_FILE).acquire()
             Beside.refused = True
         return True
 
 
-@pytest.mark.parametrize("checkpoint", ["", CHECKPOINT.replace("250", "100_000"), CHECKPOINT], ids=["none", "later", "some"])
+@pytest.mark.parametrize("checkpoint", ["", CHECKPOINT.replace("64", "100_000"), CHECKPOINT], ids=["none", "later", "some"])
 def test_a_run_belongs_to_one_process_from_its_start_to_its_end(checkpoint, monkeypatch, tmp_path):
     """... with states or without, and before the first of them is saved."""
     monkeypatch.setattr(Beside, "folder", run_of(tmp_path))
     monkeypatch.setattr(Beside, "refused", None)
     callbacks = ", ".join(filter(None, [checkpoint, "'test_resume_zoo.Beside'"]))
-    start(monkeypatch, command(tmp_path, callbacks=callbacks, n_timesteps=400))
+    start(monkeypatch, command(tmp_path, callbacks=callbacks, n_timesteps=100))
     assert Beside.refused
     other = FolderLock(run_of(tmp_path), LOCK_FILE)
     other.acquire()
@@ -258,32 +259,32 @@ def test_a_run_belongs_to_one_process_from_its_start_to_its_end(checkpoint, monk
 
 @pytest.mark.parametrize("error", [Interruption, KeyboardInterrupt])
 def test_a_run_that_was_interrupted_says_how_it_is_continued_and_is_free(error, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(Stop, "at", 180)
+    monkeypatch.setattr(Stop, "at", 46)
     monkeypatch.setitem(globals(), "Interruption", error)
-    arguments = command(tmp_path, callbacks=f"{CHECKPOINT}, 'test_resume_zoo.Stop'", n_timesteps=400)
+    arguments = command(tmp_path, callbacks=f"{CHECKPOINT}, 'test_resume_zoo.Stop'", n_timesteps=100)
     run = run_of(tmp_path)
     with pytest.raises(error) if error is not KeyboardInterrupt else nullcontext():
         start(monkeypatch, arguments)
-    stopped = "The run was interrupted at step 180 of 400."
+    stopped = "The run was interrupted at step 46 of 100."
     assert f"{stopped} It cannot be continued, as no state of it was saved in {run / 'state'}." in capsys.readouterr().out
     # rl_zoo3 saves a model after Ctrl-C
     reason = (
-        "interrupted at step 180 of 400, before it saved a state" if error is KeyboardInterrupt else "There is no state in"
+        "interrupted at step 46 of 100, before it saved a state" if error is KeyboardInterrupt else "There is no state in"
     )
     with pytest.raises(SystemExit, match=reason):
         resume(run)
-    monkeypatch.setattr(Stop, "at", 330)
+    monkeypatch.setattr(Stop, "at", 84)
     with pytest.raises(error) if error is not KeyboardInterrupt else nullcontext():
         start(monkeypatch, arguments)
     second = run.with_name("Pendulum-v1_2")
     command_line = f"{interpreter()} -m sb3_cgp.zoo.resume {second}"
-    advice = f"interrupted at step 330 of 400. Continue it, from step 250, by\n  {command_line}\n"
+    advice = f"interrupted at step 84 of 100. Continue it, from step 64, by\n  {command_line}\n"
     assert advice in capsys.readouterr().out
     monkeypatch.setattr(Stop, "at", None)
     resume(second)
     said = capsys.readouterr().out
-    assert f"Resuming the training in {second / 'state'} at step 250" in said
-    assert f"{second} has ended at step 400: its final model is {second / 'Pendulum-v1.zip'}" in said
+    assert f"Resuming the training in {second / 'state'} at step 64" in said
+    assert f"{second} has ended at step 100: its final model is {second / 'Pendulum-v1.zip'}" in said
     assert "interrupted" not in said
 
 

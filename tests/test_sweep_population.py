@@ -18,7 +18,7 @@ from benchmark.sweeps.population_run import train_group
 from benchmark.sweeps.run import run_folder
 from sb3_cgp.population import ChunkedSubprocVecEnv
 
-pytestmark = pytest.mark.usefixtures("short_final_evaluation")
+pytestmark = pytest.mark.usefixtures("short_final_evaluation", "short_episodes")
 
 CEM = dict(cem_samples=6, cem_elites=2, cem_dtype="float32")
 
@@ -108,19 +108,19 @@ def test_a_population_of_one_run_is_the_run_alone(tmp_path, runs_of, algo, own):
     ],
 )
 def test_an_interrupted_population_is_an_undisturbed_one(tmp_path, runs_of, methods):
-    runs = runs_of(methods, steps=240)
+    runs = runs_of(methods, steps=160)
     finals, taken, folders = train_together(runs, tmp_path / "straight")
-    again, as_before, others = train_together(runs, tmp_path / "stopped", 70, 215)
+    again, as_before, others = train_together(runs, tmp_path / "stopped", 70, 135)
     assert len(finals) == 4
     assert again == finals
     assert as_before.reports == taken.reports
-    assert sorted(step for _, step in taken.reports) == [step for step in range(40, 241, 40) for _ in runs]
+    assert sorted(step for _, step in taken.reports) == [step for step in range(40, 161, 40) for _ in runs]
     for run, straight, stopped in zip(runs, folders, others, strict=True):
         for name, value in policy_of(straight, run.algo).items():
             np.testing.assert_array_equal(policy_of(stopped, run.algo)[name], value, err_msg=name)
         assert rows(stopped) == rows(straight)
-        assert len(rows(straight)) == 2
-        assert list(read_curve(stopped).mean) == [taken.reports[run.key, step] for step in range(40, 241, 40)]
+        assert len(rows(straight)) == 1 + 6
+        assert list(read_curve(stopped).mean) == [taken.reports[run.key, step] for step in range(40, 161, 40)]
     assert len(set(finals.values())) == 4
 
 

@@ -119,11 +119,12 @@ def wait_for(condition, study):
         time.sleep(0.05)
 
 
+@pytest.mark.usefixtures("short_episodes")
 def test_a_population_whose_process_is_killed_goes_on_to_the_bit(tmp_path):
     methods = {"A": ("td3", NOISE), "B": ("td3", NOISE | dict(learning_rate=0.01))}
-    path = write_sweep(tmp_path, methods, seeds=2, steps=600, evaluation_interval=100, checkpoint_interval=20)
+    path = write_sweep(tmp_path, methods, seeds=2, steps=300, evaluation_interval=100, checkpoint_interval=20)
     records = []
-    for name, steps in (("straight", []), ("killed", [30, 250])):
+    for name, steps in (("straight", []), ("killed", [30, 120])):
         (tmp_path / name).mkdir()
         study = Populations(tmp_path / name, f"sqlite:///{tmp_path}/{name}/studies.db", name, path)
         try:

@@ -20,7 +20,7 @@ from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.worker_loop import execute_runs
 
-pytestmark = pytest.mark.usefixtures("short_final_evaluation")
+pytestmark = pytest.mark.usefixtures("short_final_evaluation", "short_episodes")
 
 
 @pytest.mark.filterwarnings("ignore:Agent 1 has failed")
@@ -62,7 +62,7 @@ def test_a_sweep_by_populations_has_the_runs_and_the_page_of_one_without(tmp_pat
         ledger.open(sweep, describe(sweep, ["tiny"], "cpu"))
         execute_runs(ledger, folder / "logs", "a process", device="cpu", population=size)
         exported = export_study("tiny", url, folder / "results")
-        page = figures([exported], folder / "results")
+        page = figures([exported], folder / "results", repetitions=100)
         found[size] = ledger.records(), headings(page), [*map(json.loads, (exported / "runs.jsonl").read_text().splitlines())]
     (alone, headings_alone, lines_alone), (together, headings_together, lines_together) = found[1], found[8]
     assert headings_together == headings_alone
@@ -84,13 +84,13 @@ def test_a_sweep_by_populations_has_the_runs_and_the_page_of_one_without(tmp_pat
 @pytest.mark.filterwarnings("ignore:Agent 1 has failed")
 @pytest.mark.parametrize("is_removed", [False, True])
 def test_the_folder_of_a_run_that_has_failed_remains_as_it_is(tmp_path, monkeypatch, is_removed):
-    path = write_sweep(tmp_path, {"A": ("td3", {}), "B": ("td3", dict(learning_rate=1e30))}, seeds=1, steps=430)
+    path = write_sweep(tmp_path, {"A": ("td3", {}), "B": ("td3", dict(learning_rate=1e30))}, seeds=1, steps=60)
     sweep, ledger = load_sweep(str(path)), Ledger(InMemoryStorage(), "tiny")
     ledger.open(sweep, {"experiment": sweep.name})
     report = population_run.PopulationReporter._on_step
     with monkeypatch.context() as patch:
         # The first episode has ended
-        stopping = lambda self: report(self) and (self.n_calls < 210 or interrupt_at(0)(0))  # noqa: E731
+        stopping = lambda self: report(self) and (self.n_calls < 35 or interrupt_at(0)(0))  # noqa: E731
         patch.setattr(population_run.PopulationReporter, "_on_step", stopping)
         patch.setattr(worker_loop, "MACHINE_ERRORS", Interruption)
         with pytest.raises(Interruption):
