@@ -109,7 +109,7 @@ test-oldest: ## run the quick tests with the oldest versions that setup.cfg admi
 	$(MAKE) VENV=.venv-oldest CONSTRAINTS=constraints-oldest.txt test-quick
 
 test-slow: $(TESTS_INSTALLED) ## run the tests that take minutes: learning, packaging
-	$(PYTEST) --dist loadfile -m slow
+	$(PYTEST) --dist loadgroup -m slow
 
 test-environments: $(SWEEPS_INSTALLED) ## test CGP on other packages' environments, each in a virtual environment of its own
 	$(IN_VENV) -m benchmark.environments $(if $(PACKAGES),--packages $(PACKAGES)) $(ARGS)

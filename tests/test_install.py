@@ -22,7 +22,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-pytestmark = pytest.mark.slow
+# In one process, as its tests share environments that take long to set up
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("install")]
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ["sb3_cgp", "hyperparams", "_build_backend.py", "_sb3_cgp_zoo.py", "setup.cfg", "setup.py", "pyproject.toml"]
