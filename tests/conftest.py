@@ -9,6 +9,8 @@ import gymnasium as gym
 import pytest
 import torch as th
 
+from sb3_cgp.resumption.signals import StopSignals
+
 HAS_GPU = th.cuda.is_available()
 
 
@@ -39,6 +41,16 @@ def _signal_handlers():
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture
+def handler():
+    """SIGTERM's handler, which every training must leave as it was, and no training in progress."""
+    handler = signal.getsignal(signal.SIGTERM)
+    yield handler
+    assert StopSignals.current() is None
+    left, _ = signal.getsignal(signal.SIGTERM), signal.signal(signal.SIGTERM, handler)
+    assert left is handler
 
 
 @pytest.fixture

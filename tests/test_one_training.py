@@ -19,8 +19,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
-from test_callbacks import make_model
-from trainings import SMALL, Do, Interruption, Stop
+from trainings import SMALL, Do, Interruption, Stop, make_model
 
 from sb3_cgp import CGP
 from sb3_cgp.common.files import write_atomically

@@ -28,7 +28,6 @@ from sb3_cgp.resumption import TrainingCheckpointCallback
 from sb3_cgp.resumption.algorithm import resumable
 from sb3_cgp.resumption.store import StateStore
 
-
 pytestmark = pytest.mark.usefixtures("short_episodes")
 
 

@@ -268,9 +268,7 @@ def test_a_run_that_was_interrupted_says_how_it_is_continued_and_is_free(error, 
     stopped = "The run was interrupted at step 46 of 100."
     assert f"{stopped} It cannot be continued, as no state of it was saved in {run / 'state'}." in capsys.readouterr().out
     # rl_zoo3 saves a model after Ctrl-C
-    reason = (
-        "interrupted at step 46 of 100, before it saved a state" if error is KeyboardInterrupt else "There is no state in"
-    )
+    reason = "interrupted at step 46 of 100, before it saved a state" if error is KeyboardInterrupt else "There is no state in"
     with pytest.raises(SystemExit, match=reason):
         resume(run)
     monkeypatch.setattr(Stop, "at", 84)

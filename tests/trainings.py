@@ -16,6 +16,17 @@ from sb3_cgp.resumption import TrainingCheckpointCallback
 SMALL = dict(learning_starts=20, buffer_size=150, batch_size=8, cem_samples=8, cem_elites=2, seed=0, device="cpu")
 
 
+def make_model(**arguments):
+    """Make a small model on Pendulum-v1."""
+    arguments = dict(env=make_vec_env("Pendulum-v1", seed=1), policy_kwargs=dict(net_arch=[8])) | SMALL | arguments
+    return CGP("MlpPolicy", **arguments)
+
+
+def parameters_equal(one, other):
+    pairs = zip(one.policy.state_dict().values(), other.policy.state_dict().values(), strict=True)
+    return all(ours.equal(theirs) for ours, theirs in pairs)
+
+
 class Interruption(Exception):
     """Whatever may end a training."""
 
