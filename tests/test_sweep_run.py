@@ -15,7 +15,8 @@ from benchmark.sweeps.random_actions import RandomActions
 from benchmark.sweeps.run import forget_states, run_folder, train
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm, resumable
 
-TINY = dict(learning_starts=40, batch_size=8, buffer_size=400, policy_kwargs="dict(net_arch=[8, 8])")
+pytestmark = pytest.mark.usefixtures("short_episodes")
+TINY = dict(learning_starts=20, batch_size=8, buffer_size=400, policy_kwargs="dict(net_arch=[8, 8])")
 
 
 class Interruption(Exception):
@@ -31,11 +32,11 @@ def run_of(tmp_path):
             title="A sweep",
             methods={"M": {"algo": algo, "hyperparams": {"policy": "MlpPolicy"} | hyperparams, "tuned": tuned}},
             tasks=[task],
-            steps=500,
+            steps=250,
             seeds=[3],
-            evaluation_interval=100,
+            evaluation_interval=50,
             evaluation_episodes=2,
-            checkpoint_interval=60,
+            checkpoint_interval=30,
         )
         (tmp_path / "mine.yml").write_text(yaml.safe_dump(content))
         (run,) = load_sweep(str(tmp_path / "mine.yml")).runs()
@@ -69,7 +70,7 @@ def test_an_interrupted_run_is_an_undisturbed_one(tmp_path, run_of, algo):
     run = run_of(algo, **TINY)
     final, reports = trained(run, tmp_path / "straight")
     assert (tmp_path / "straight" / "Pendulum-v1.zip").is_file()
-    assert trained(run, tmp_path / "stopped", 130, 390) == (final, reports)
+    assert trained(run, tmp_path / "stopped", 65, 195) == (final, reports)
     straight, stopped = (policy_of(tmp_path / name, algo) for name in ("straight", "stopped"))
     for name, value in straight.items():
         np.testing.assert_array_equal(stopped[name], value, err_msg=name)
@@ -79,13 +80,13 @@ def test_reports_are_the_usual_evaluations(tmp_path, run_of):
     _, reports = trained(run_of(**TINY), tmp_path)
     curve = read_curve(tmp_path)
     assert reports == dict(zip(curve.timesteps, curve.mean, strict=True))
-    assert list(reports) == [100, 200, 300, 400, 500]
+    assert list(reports) == [50, 100, 150, 200, 250]
 
 
 def test_offline_training_adds_no_points_and_is_scored_at_its_end(tmp_path, run_of, monkeypatch):
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 60)
     final, reports = trained(run_of("cgp", **TINY, policy_training="offline"), tmp_path)
-    assert list(reports) == [100, 200, 300, 400, 500]
+    assert list(reports) == [50, 100, 150, 200, 250]
     model = ALGOS["cgp"].load(run_in(tmp_path).model_path)
     assert model.policy.inference == "actor"
     assert np.isfinite(final)
@@ -111,8 +112,8 @@ def test_the_other_scripts_of_rl_zoo3_find_what_they_look_for(tmp_path, run_of):
 def test_what_is_trained_is_what_the_sweep_says(tmp_path, run_of):
     trained(run_of("sac", **TINY, learning_rate=0.002, gamma=0.9), tmp_path)
     model = ALGOS["sac"].load(run_in(tmp_path).model_path)
-    assert (model.learning_rate(1.0), model.gamma, model.batch_size, model.learning_starts) == (0.002, 0.9, 8, 40)
-    assert model.num_timesteps == 500
+    assert (model.learning_rate(1.0), model.gamma, model.batch_size, model.learning_starts) == (0.002, 0.9, 8, 20)
+    assert model.num_timesteps == 250
 
 
 def test_a_tuned_method_starts_from_the_tasks_entry(tmp_path, run_of):
@@ -120,13 +121,13 @@ def test_a_tuned_method_starts_from_the_tasks_entry(tmp_path, run_of):
     trained(run, tmp_path)
     model = ALGOS["cgp"].load(run_in(tmp_path).model_path)
     assert (model.tau, model.gamma, model.batch_size) == (0.02, 0.98, 8)
-    assert model.num_timesteps == 500
+    assert model.num_timesteps == 250
 
 
 def test_algorithms_without_states_start_anew(tmp_path, run_of):
     run = run_of("ppo", n_steps=64, batch_size=32, policy_kwargs="dict(net_arch=[8])")
     final, reports = trained(run, tmp_path / "straight")
-    assert trained(run, tmp_path / "stopped", 200) == (final, reports)
+    assert trained(run, tmp_path / "stopped", 100) == (final, reports)
 
 
 def test_random_actions_are_uniform_and_learn_nothing(tmp_path, run_of):
@@ -154,7 +155,7 @@ def test_a_run_whose_states_are_all_damaged_begins_anew(tmp_path, run_of):
     run = run_of(**TINY)
     straight = trained(run, tmp_path / "straight")
     with pytest.raises(Interruption):
-        train(run, tmp_path / "stopped", lambda step, value: None, interrupt_at(300), "cpu")
+        train(run, tmp_path / "stopped", lambda step, value: None, interrupt_at(150), "cpu")
     (manifest,) = (tmp_path / "stopped" / "state").glob("state-*.json")
     manifest.write_text("cut sh")
     assert trained(run, tmp_path / "stopped") == straight
@@ -162,7 +163,7 @@ def test_a_run_whose_states_are_all_damaged_begins_anew(tmp_path, run_of):
 
 def test_callbacks_of_ones_own_are_kept(tmp_path, run_of):
     callback = {
-        "stable_baselines3.common.callbacks.CheckpointCallback": {"save_freq": 200, "save_path": str(tmp_path / "own")}
+        "stable_baselines3.common.callbacks.CheckpointCallback": {"save_freq": 100, "save_path": str(tmp_path / "own")}
     }
     trained(run_of(**TINY, callback=callback), tmp_path / "run")
     assert len(list((tmp_path / "own").glob("*.zip"))) == 2
@@ -171,7 +172,7 @@ def test_callbacks_of_ones_own_are_kept(tmp_path, run_of):
 def test_a_run_is_not_taken_up_from_the_states_of_another(tmp_path, run_of):
     """... which a study of the same name has left, in a storage that is gone."""
     with pytest.raises(Interruption):
-        train(run_of(**TINY), tmp_path / "used", lambda step, value: None, interrupt_at(200), "cpu")
+        train(run_of(**TINY), tmp_path / "used", lambda step, value: None, interrupt_at(100), "cpu")
     run = run_of(**TINY, learning_rate=0.01)
     assert trained(run, tmp_path / "used") == trained(run, tmp_path / "fresh")
 
@@ -200,13 +201,13 @@ def test_a_run_that_was_interrupted_after_its_last_step_has_its_whole_curve(tmp_
 
 def test_a_tuned_method_goes_on_with_what_the_tasks_entry_says(tmp_path, run_of, monkeypatch):
     """... of normalization, say, which is no argument of the algorithm."""
-    entry = {"n_timesteps": 500, "policy": "MlpPolicy", "normalize": True}
+    entry = {"n_timesteps": 250, "policy": "MlpPolicy", "normalize": True}
     monkeypatch.setattr("sb3_cgp.zoo.registration.hyperparams_folder", lambda: tmp_path)
     (tmp_path / "cgp.yml").write_text(yaml.safe_dump({"Pendulum-v1": entry}))
     run = run_of("cgp", tuned=True, **TINY, cem_samples=8, cem_elites=2)
     straight = trained(run, tmp_path / "straight")
     assert run_in(tmp_path / "straight").read_yaml("config.yml")["normalize"]
-    assert trained(run, tmp_path / "stopped", 130, 390) == straight
+    assert trained(run, tmp_path / "stopped", 65, 195) == straight
 
 
 def test_a_final_return_that_is_no_number_is_a_failure(tmp_path, run_of, monkeypatch):
