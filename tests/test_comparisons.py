@@ -118,10 +118,10 @@ def test_differences_on_each_task_and_on_all_that_have_enough_runs(tmp_path: Pat
     assert found["Ant-v5", "CGP-Online − TD3"][1] == NOT_DISTINGUISHABLE
     assert found["Pusher-v5", "CGP-Light − TD3"][1:] == [TOO_FEW, "2 and 2"]
     # The best reward is 112, or 11.2; the lowest return 12, or 0
-    share, word, number = found["all tasks (2)", "CGP-Light − CGP-Online"]
+    share, word, number = found["Hopper-v5, Ant-v5", "CGP-Light − CGP-Online"]
     assert float(share.split()[0]) == pytest.approx((50 / 100 + 5 / 11.2) / 2, abs=1e-3)
     assert (word, number) == (HIGHER, "8 and 8")
-    assert found["all tasks (2)", "CGP-Online − TD3"][1] == NOT_DISTINGUISHABLE
+    assert found["Hopper-v5, Ant-v5", "CGP-Online − TD3"][1] == NOT_DISTINGUISHABLE
     assert not any("Random" in pair for _, pair in found)
 
 
@@ -164,7 +164,7 @@ def test_all_tasks_are_those_on_which_both_were_compared(tmp_path: Path) -> None
     one = study(tmp_path, [*scored(pair, both), *scored(["CGP-Online"], ["Pusher-v5"])], "one")
     other = study(tmp_path, scored(["TD3"], ["Pusher-v5"]), "other")
     ((name, _, *found),) = pooled_rows(score_table([one, other]), pair, 200)
-    assert (name, found[-1]) == ("all tasks (2)", "8 and 8")
+    assert (name, found[-1]) == ("Hopper-v5, Ant-v5", "8 and 8")
     ((_, _, *expected),) = pooled_rows(score_table([study(tmp_path, scored(pair, both), "both")]), pair, 200)
     assert found == expected
 
@@ -210,7 +210,9 @@ def test_losses_are_named_with_their_tasks(tmp_path: Path) -> None:
 
 
 def test_no_loss_and_nothing_known(tmp_path: Path) -> None:
-    assert "**No loss is shown on 1 of 1 tasks" in compared(tmp_path / "equal", {"Hopper-v5": 50.0})
+    assert "**Not decided: of 1 tasks, CGP-Light is higher on 0, lower on none, and not distinguishable on 1.**" in compared(
+        tmp_path / "equal", {"Hopper-v5": 50.0}
+    )
     text = compared(tmp_path / "few", {"Hopper-v5": 10.0}, seeds=3)
     assert "**Not known yet: on no task have 4 seeds of both methods ended.**" in text
     assert "Too few seeds have ended on Hopper-v5" in text
@@ -256,7 +258,7 @@ def test_tasks_that_one_of_them_lacks_and_studies_that_do_not_compare_them(tmp_p
     both = runs(lambda *_: 1.0, ["CGP-Light", "CGP-Online"], tasks=["Hopper-v5"])
     unfinished = study(tmp_path, [*both, *runs(lambda *_: 1.0, ["CGP-Light"], tasks=["Ant-v5"])], "unfinished")
     text = light_section([unfinished])
-    assert "**No loss is shown on 1 of 2 tasks" in text
+    assert "**Not decided: of 2 tasks, CGP-Light is higher on 0, lower on none, and not distinguishable on 1.**" in text
     assert "No runs of both have ended, or all have failed, on Ant-v5 (unfinished, 1,000 steps)." in text
     swept = runs(lambda *_: 1.0, ["CGP-Light", "CGP-Online"], [{"width": 32}, {"width": 64}])
     assert light_section([study(tmp_path, swept, "swept")]) == ""

@@ -11,6 +11,7 @@ from benchmark.reporting.comparisons import RANDOM, task_difference
 from benchmark.reporting.estimates import (
     FEWEST_RUNS,
     REPETITIONS,
+    Estimate,
     Statistic,
     compare,
     difference,
@@ -92,8 +93,9 @@ def best_or_second(table: pd.DataFrame) -> list[Part]:
             rank = 1 + sum(mean > means[0] for mean in means[1:])
             higher, lower = verdicts.count(SUPPORTED), verdicts.count(CONTRADICTED)
             verdict = SUPPORTED if higher >= len(rivals) - 1 else CONTRADICTED if lower >= 2 else NOT_DECIDED
-            place = f"rank {rank} of {len(means)} on {task}"
-            parts.append(Part(f"{place}, higher than {higher} and lower than {lower} of {len(rivals)} rivals", verdict))
+            counted = f"higher than {higher} and lower than {lower} of {len(rivals)} rivals"
+            decided = counted if higher or lower else f"not distinguishable from any of {len(rivals)} rivals"
+            parts.append(Part(f"rank {rank} of {len(means)} on {task}, {decided}", verdict))
     return parts
 
 
@@ -115,7 +117,7 @@ def narrower(table: pd.DataFrame, repetitions: int) -> list[Part]:
         )
         if found is not None:
             ours, theirs = _each(usual, pair, interquartile_range)
-            text = f"range {ours:.3f} against {baseline}'s {theirs:.3f}: narrower by {found.in_words('.3f')}"
+            text = f"range {ours:.3f} against {baseline}'s {theirs:.3f}: {_signed(found, 'narrower', 'wider')}"
             note = ""
             if len(in_common(usual, pair)) < len(in_common(table, pair)):
                 ours, theirs = _each(table, pair, interquartile_range)
@@ -136,7 +138,7 @@ def imitation(table: pd.DataFrame, repetitions: int) -> list[Part]:
     if found is None:
         return []
     ours, theirs = _each(table, (OURS, IMITATED), interquartile_mean)
-    text = f"interquartile mean {ours:.2f} against {IMITATED}'s {theirs:.2f}: higher by {found.in_words('.3f')}"
+    text = f"interquartile mean {ours:.2f} against {IMITATED}'s {theirs:.2f}: {_signed(found, 'higher', 'lower')}"
     return [Part(text, judge(found, more_than=-MARGIN))]
 
 
@@ -213,9 +215,15 @@ def _differences(
         found = compare(common, pair, lambda ours, theirs: statistic(ours) - statistic(theirs), repetitions=repetitions)
         if found is not None:
             ours, theirs = _each(common, pair, statistic)
-            text = f"{name} of {pair[0]} {ours:.2f}, of {pair[1]} {theirs:.2f}: higher by {found.in_words('.3f')}"
+            text = f"{name} of {pair[0]} {ours:.2f}, of {pair[1]} {theirs:.2f}: {_signed(found, 'higher', 'lower')}"
             parts.append(Part(text, judge(found, **bounds)))
     return parts
+
+
+def _signed(found: Estimate, more: str, less: str) -> str:
+    """Return a difference as text, such as "higher by 0.05 (0.01 to 0.09)", or "lower by" the opposite number."""
+    word, size = (more, found) if found.value >= 0 else (less, found.negative())
+    return f"{word} by {size.in_words('.3f')}"
 
 
 def online_better(table: pd.DataFrame, repetitions: int) -> list[Part]:

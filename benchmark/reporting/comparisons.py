@@ -110,7 +110,7 @@ def differences_table(table: pd.DataFrame, methods: Sequence[str], repetitions: 
 
 def pooled_rows(table: pd.DataFrame, methods: Sequence[str], repetitions: int = REPETITIONS) -> list[list[str]]:
     """
-    Return the rows of a table of differences that are on all tasks together.
+    Return the rows of a table of differences that are on all tasks together, or on those with enough runs of both methods.
 
     :param table: the scores of runs without axes, of one study or of several
     :param methods: the methods, in order
@@ -125,7 +125,8 @@ def pooled_rows(table: pd.DataFrame, methods: Sequence[str], repetitions: int = 
         runs = common[common["task"].isin(enough)]
         pooled = compare(runs, pair, mean_difference, repetitions=repetitions)
         if len(enough) > 1 and pooled is not None:
-            rows.append(_row(f"all tasks ({len(enough)})", pair, pooled, ".3f", runs))
+            scope = f"all tasks ({len(tasks)})" if enough == tasks else ", ".join(enough)
+            rows.append(_row(scope, pair, pooled, ".3f", runs))
     return rows
 
 
@@ -185,8 +186,8 @@ def improvement_table(table: pd.DataFrame, methods: Sequence[str], repetitions: 
         return ""
     header = [f"{OURS} against", *tasks, *["all tasks"] * (len(tasks) > 1)]
     note = (
-        "The probability that a run of it scores more than one of the other method, both of a configuration that both ran, "
-        "with ties as half (95 % interval)."
+        f"The probability that a random run of {OURS} has a higher final reward than one of the other method with the same "
+        "configuration; a tie counts one half (95 % interval)."
     )
     return f"{markdown_table(header, rows)}\n\n{note}"
 

@@ -36,7 +36,7 @@ CURVES = (
 LITERATURE = " Open markers are mean returns from the literature, on other versions of the environment (table below)."
 MINUTES = (
     "The same on {} by minutes of processor time, of all threads, evaluations included. A run's evaluation is placed at the "
-    "run's time times the evaluation's step divided by the run's steps, and a method's curve at the mean over its runs."
+    "run's time times the evaluation's step divided by the run's steps, and a method's curve at the median over its runs."
 )
 SENSITIVITY = "learning curves, every seed (thin) and the interquartile mean over seeds (bold), on one vertical scale."
 STABILITY = (

@@ -87,7 +87,7 @@ def times_of(study: Study, task: str) -> Times:
     Return a task's runs that curves by minutes show, and how long each method trains.
 
     The time of a run is shared evenly among its steps, so that an evaluation takes place at ``processor_seconds`` times
-    its step, divided by the run's steps. An evaluation of a method stands at the mean of its runs' times: of those on the
+    its step, divided by the run's steps. An evaluation of a method stands at the median of its runs' times: of those on the
     processor that trained the most runs, among the processors that trained all methods, or of all runs if there is none. A
     failed run has the time of the method's other runs, as the step at which it failed is not recorded.
 
@@ -102,7 +102,7 @@ def times_of(study: Study, task: str) -> Times:
     seconds: dict[str, list[float]] = {}
     for record in compared:
         seconds.setdefault(record.method, []).append((record.processor_seconds or 0.0) / record.steps)
-    paces = {method: float(np.mean(each)) / 60 for method, each in seconds.items()}
+    paces = {method: float(np.median(each)) / 60 for method, each in seconds.items()}
     kept = [record for record in measured if record.method in paces]
     return Times(kept, paces, _all_processors(study, compared), _all_processors(study, kept))
 

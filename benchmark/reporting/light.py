@@ -103,8 +103,10 @@ def answer(compared: Sequence[Comparison], missing: Sequence[str]) -> str:
     if losses:
         sentences = [f"**Yes, on {'; '.join(losses)}.**"]
     elif decided:
-        counted = f"{len(decided)} of {total} tasks, those with {FEWEST_RUNS} or more seeds of both"
-        sentences = [f"**No loss is shown on {counted}.**"]
+        higher = sum(each.word == HIGHER for each in decided)
+        answer_word = "No" if higher == total else "Not decided"
+        counted = f"higher on {higher}, lower on none, and not distinguishable on {len(decided) - higher}"
+        sentences = [f"**{answer_word}: of {total} tasks, {LIGHT} is {counted}.**"]
     else:
         sentences = [f"**Not known yet: on no task have {FEWEST_RUNS} seeds of both methods ended.**"]
     failures = [

@@ -232,7 +232,7 @@ def comparison_tables(table: pd.DataFrame, study: Study, repetitions: int = REPE
         parts += ["**Differences between methods**", differences]
     improvement = improvement_table(table, study.methods, repetitions)
     if improvement:
-        parts.append(fold(f"How often {OURS} improves", improvement))
+        parts.append(fold(f"Probability that {OURS} improves on the others", improvement))
     return parts
 
 
