@@ -120,6 +120,7 @@ class CGP(
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+    changeable_arguments: ClassVar[tuple[str, ...]] = (*SelectorAlgorithm.changeable_arguments, "cem_dtype")
 
     @checks_arguments
     def __init__(
@@ -210,10 +211,17 @@ class CGP(
         )
 
     def _setup_model(self) -> None:
-        require_choice("cem_dtype", self.cem_dtype, SCORING_DTYPES)
         given = self.policy_kwargs.get("cem_dtype")
         require(given is None, "policy_kwargs['cem_dtype']", given, "given as `cem_dtype`, outside `policy_kwargs`")
         super()._setup_model()
+        self._follow_arguments()
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        require_choice("cem_dtype", self.cem_dtype, SCORING_DTYPES)
+
+    def _follow_arguments(self) -> None:
+        super()._follow_arguments()
         self.policy.cem_dtype = self.cem_dtype  # type: ignore[assignment]
 
     @suggests_names

@@ -31,8 +31,8 @@ def make_model(policy="MlpPolicy", **kwargs):
 @pytest.mark.parametrize(
     ("make", "name"),
     [
-        (lambda: ActorCEM(actor_fraction=1.5), "fraction"),
-        (lambda: ActorCEM(actor_std=-1.0), "std"),
+        (lambda: ActorCEM(actor_fraction=1.5), "actor_fraction"),
+        (lambda: ActorCEM(actor_std=-1.0), "actor_std"),
         (lambda: ActorCEM(samples=3), "elites"),
         (lambda: ActorStart(math.nan), "fraction"),
         (lambda: MPPI(temperature=0.0), "temperature"),

@@ -5,6 +5,7 @@ Shapes: B states, N samples per state, K elites per state, A action dimensions.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import torch as th
@@ -47,6 +48,7 @@ class ActionSelector(Protocol):
         """
 
 
+@dataclass
 class CEM:
     """
     Cross-Entropy Method with independent Gaussians (Algorithm 1), squashed by tanh into the action space.
@@ -59,15 +61,13 @@ class CEM:
     :raises ValueError: if an argument is out of its range
     """
 
-    def __init__(self, iterations: int = 2, samples: int = 64, elites: int = 6, result: str = "best"):
-        check_cem(iterations, samples, elites, result)
-        self.iterations = iterations
-        self.samples = samples
-        self.elites = elites
-        self.result = result
+    iterations: int = 2
+    samples: int = 64
+    elites: int = 6
+    result: str = "best"
 
-    def __repr__(self) -> str:
-        return f"CEM(iterations={self.iterations}, samples={self.samples}, elites={self.elites}, result={self.result!r})"
+    def __post_init__(self) -> None:
+        check_cem(self.iterations, self.samples, self.elites, self.result)
 
     @th.no_grad()
     def select(self, score: Score, n_states: int, action_dim: int, device: th.device | str = "cpu") -> Selection:

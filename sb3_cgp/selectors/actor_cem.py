@@ -4,12 +4,15 @@ The Cross-Entropy Method that starts from the actor's action.
 Shapes: B states, P proposals, N samples and K elites per state, A action dimensions.
 """
 
+from dataclasses import dataclass
+
 import torch as th
 
 from sb3_cgp.core.cem import CEM, Score, Selection, find_elites, fit_gaussian
-from sb3_cgp.selectors.proposals import ActorStart, take
+from sb3_cgp.selectors.proposals import ActorStart, check_start, take
 
 
+@dataclass
 class ActorCEM(CEM):
     """
     CEM whose first samples include the actor's action, and samples around it.
@@ -28,21 +31,19 @@ class ActorCEM(CEM):
 
     takes_proposals = True
 
-    def __init__(
-        self,
-        iterations: int = 1,
-        samples: int = 16,
-        elites: int = 6,
-        result: str = "best",
-        actor_fraction: float = 0.5,
-        actor_std: float = 0.3,
-    ):
-        super().__init__(iterations, samples, elites, result)
-        self.start = ActorStart(actor_fraction, actor_std)
+    iterations: int = 1
+    samples: int = 16
+    actor_fraction: float = 0.5
+    actor_std: float = 0.3
 
-    def __repr__(self) -> str:
-        start = f"actor_fraction={self.start.fraction}, actor_std={self.start.std}"
-        return f"Actor{super().__repr__()[:-1]}, {start})"
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_start(self.actor_fraction, self.actor_std, prefix="actor_")
+
+    @property
+    def start(self) -> ActorStart:
+        """How the first samples start from the actor's action."""
+        return ActorStart(self.actor_fraction, self.actor_std)
 
     @th.no_grad()
     def select(

@@ -1,5 +1,7 @@
 """The actor alone as a selector: without a search, CGP is TD3 or DDPG."""
 
+from dataclasses import dataclass
+
 import torch as th
 
 from sb3_cgp.common.rules import require
@@ -7,6 +9,7 @@ from sb3_cgp.core.cem import Score, Selection
 from sb3_cgp.selectors.proposals import before_tanh
 
 
+@dataclass
 class ActorOnly:
     """
     Selects the actor's action, and never asks the critic.
@@ -16,9 +19,6 @@ class ActorOnly:
     """
 
     takes_proposals = True
-
-    def __repr__(self) -> str:
-        return "ActorOnly()"
 
     def select(
         self,

@@ -4,6 +4,8 @@ Model Predictive Path Integral control (MPPI) for one step: elites count by thei
 Shapes: B states, P proposals, N samples and K elites per state, A action dimensions.
 """
 
+from dataclasses import dataclass
+
 import torch as th
 
 from sb3_cgp.common.rules import require, require_number
@@ -12,6 +14,7 @@ from sb3_cgp.core.cem import Score, Selection, find_elites
 from sb3_cgp.selectors.proposals import ActorStart, take
 
 
+@dataclass
 class MPPI:
     """
     Fits each next Gaussian to the elites weighted by the softmax of their values, as TD-MPC2 does.
@@ -29,35 +32,24 @@ class MPPI:
     :raises ValueError: if an argument is out of its range
     """
 
-    def __init__(
-        self,
-        iterations: int = 2,
-        samples: int = 64,
-        elites: int = 6,
-        result: str = "mean",
-        temperature: float = 0.5,
-        start: ActorStart | None = None,
-    ):
-        check_cem(iterations, samples, elites, result)
-        require_number("temperature", temperature)
-        require(temperature > 0, "temperature", temperature, "above 0")
-        is_start = start is None or isinstance(start, ActorStart)
-        require(is_start, "start", start, "None, or an instance of sb3_cgp.selectors.ActorStart")
-        self.iterations = iterations
-        self.samples = samples
-        self.elites = elites
-        self.result = result
-        self.temperature = temperature
-        self.start = start
+    iterations: int = 2
+    samples: int = 64
+    elites: int = 6
+    result: str = "mean"
+    temperature: float = 0.5
+    start: ActorStart | None = None
+
+    def __post_init__(self) -> None:
+        check_cem(self.iterations, self.samples, self.elites, self.result)
+        require_number("temperature", self.temperature)
+        require(self.temperature > 0, "temperature", self.temperature, "above 0")
+        is_start = self.start is None or isinstance(self.start, ActorStart)
+        require(is_start, "start", self.start, "None, or an instance of sb3_cgp.selectors.ActorStart")
 
     @property
     def takes_proposals(self) -> bool:
         """Whether the first samples start from the actor's action."""
         return self.start is not None
-
-    def __repr__(self) -> str:
-        sizes = f"iterations={self.iterations}, samples={self.samples}, elites={self.elites}"
-        return f"MPPI({sizes}, result={self.result!r}, temperature={self.temperature}, start={self.start})"
 
     @th.no_grad()
     def select(

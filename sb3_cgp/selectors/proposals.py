@@ -69,6 +69,15 @@ class ActorStart:
         """
         return min(round(self.fraction * n_samples), n_samples - n_proposals)
 
+    def leaves_others(self, n_samples: int) -> bool:
+        """
+        Return whether some samples may differ from a single proposal.
+
+        :param n_samples: number of samples, N
+        :return: False if all of them are the proposal itself, so that a search finds nothing else
+        """
+        return n_samples > 1 and (self.std > 0 or self.n_around(n_samples) < n_samples - 1)
+
     def move(self, samples: th.Tensor, proposals: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         Make first samples from standard normal ones.
