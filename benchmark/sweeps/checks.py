@@ -1,6 +1,7 @@
 """Checks of values before the first run starts: each configuration has to become a model."""
 
 import argparse
+import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +24,7 @@ from benchmark.sweeps.validation import SweepError
 
 # A replay buffer that is only constructed needs no more memory than this
 LARGEST_BUFFER = 10_000
-# Configurations of a tuning, of which one has to become a model
+# Configurations of a tuning that are tried, of which one has to become a model
 N_SAMPLES = 10
 
 
@@ -44,13 +45,14 @@ def check_values(sweep: Sweep) -> None:
 
 def check_tuning(tuning: Tuning) -> None:
     """
-    Check that some sampled configuration becomes a model, with the task's entry and the hyperparameters that are fixed.
+    Check that some sampled configuration becomes a model, with the task's entry and the hyperparameters that are fixed, and
+    warn if others do not.
 
     :param tuning: the tuning
     :raises SweepError: if none of several does; it names the first one's error
     """
     study = optuna.create_study(sampler=RandomSampler(seed=0))
-    first: Exception | None = None
+    errors: list[Exception] = []
     for _ in range(N_SAMPLES):
         trial = study.ask()
         tuning.sample(trial)
@@ -59,11 +61,17 @@ def check_tuning(tuning: Tuning) -> None:
         for key, problem in problems("the tuned method", run.algo, hyperparams):
             raise SweepError("The tuned configurations", key, problem)
         try:
-            return construct(run)
+            construct(run)
         except Exception as error:
-            first = first or error
-    assert first is not None
-    raise SweepError("The tuned configurations", "", f"no model can be made: {_in_words(first)}") from first
+            errors.append(error)
+    if len(errors) == N_SAMPLES:
+        raise SweepError("The tuned configurations", "", f"no model can be made: {_in_words(errors[0])}") from errors[0]
+    if errors:
+        print(
+            f"Warning: of {N_SAMPLES} sampled configurations, {len(errors)} cannot be trained ({_in_words(errors[0])}). Trials "
+            "with such ones fail, and count for --trials; to avoid them, set the hyperparameter that contradicts by --set, too",
+            file=sys.stderr,
+        )
 
 
 def _in_words(error: Exception) -> str:

@@ -1,6 +1,7 @@
 """Entries of rl_zoo3's YAML files: the entry of a task, the entry of a sampled configuration, and writing an entry."""
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 from benchmark.common.zoo import read_entry
 from benchmark.sweeps.sweep_files import Hyperparams
 from sb3_cgp.common.files import write_atomically
+from sb3_cgp.zoo.folders import ALGO
+from sb3_cgp.zoo.search_space import convert_cgp_params
 
 # The parameters that only rl_zoo3's sampler for hindsight replay suggests
 HER_KWARGS = ("n_sampled_goal", "goal_selection_strategy")
@@ -31,7 +34,9 @@ def base_entry(algo: str, task: str, conf_file: str | None = None) -> Hyperparam
         raise ValueError(f"The hyperparameters of {algo} for {task} are no plain data: {error}") from error
 
 
-def sampled_entry(algo: str, base: Hyperparams, params: Mapping[str, Any]) -> Hyperparams:
+def sampled_entry(
+    algo: str, base: Hyperparams, params: Mapping[str, Any], fixed: Mapping[str, Any] | None = None
+) -> Hyperparams:
     """
     Return the entry of a YAML file with the parameters of a trial.
 
@@ -41,16 +46,19 @@ def sampled_entry(algo: str, base: Hyperparams, params: Mapping[str, Any]) -> Hy
     :param algo: the algorithm's name in rl_zoo3
     :param base: the task's entry
     :param params: the trial's parameters
+    :param fixed: hyperparameters that replace sampled ones, and that other sampled ones follow
     :return: the entry
     """
-    sampled = HYPERPARAMS_CONVERTER[algo](dict(params))
+    fixed = fixed or {}
+    convert = partial(convert_cgp_params, fixed=fixed) if algo == ALGO else HYPERPARAMS_CONVERTER[algo]
+    sampled = convert(dict(params))
     if "policy_kwargs" in sampled:
         sampled["policy_kwargs"] = _in_python(sampled["policy_kwargs"])
     her_kwargs = {name: sampled.pop(name) for name in HER_KWARGS if name in sampled} | sampled.pop("replay_buffer_kwargs", {})
     if her_kwargs:
         sampled["replay_buffer_kwargs"] = _in_python(_evaluated(base.get("replay_buffer_kwargs", {})) | her_kwargs)
-    entry = {**base, **sampled}
-    # rl_zoo3's converters use None for no noise, which is no argument of the algorithms; then the base entry's std goes, too
+    entry = {**base, **sampled, **fixed}
+    # rl_zoo3's converters use None for no noise, which is no argument of the algorithms; then the std goes, too
     if entry.get("noise_type") is None:
         entry.pop("noise_type", None)
         entry.pop("noise_std", None)

@@ -58,9 +58,9 @@ class Tuning:
         n_actions = env.action_space.shape[0] if isinstance(env.action_space, spaces.Box) else 0
         env.close()
         uses_her = "HerReplayBuffer" in str(self.base.get("replay_buffer_class"))
-        HYPERPARAMS_SAMPLER[self.algo](
-            trial, n_actions, self.base.get("n_envs", 1), {"using_her_replay_buffer": uses_her, "her_kwargs": {}}
-        )
+        # Only CGP's sampler looks at the fixed ones
+        additional_args = {"using_her_replay_buffer": uses_her, "her_kwargs": {}, "fixed": self.fixed}
+        HYPERPARAMS_SAMPLER[self.algo](trial, n_actions, self.base.get("n_envs", 1), additional_args)
 
     def entry(self, trial: FrozenTrial) -> Hyperparams:
         """
@@ -69,7 +69,7 @@ class Tuning:
         :param trial: the trial
         :return: an entry of rl_zoo3's YAML files
         """
-        return {**sampled_entry(self.algo, self.base, trial.params), **self.fixed, "n_timesteps": self.steps}
+        return {**sampled_entry(self.algo, self.base, trial.params, self.fixed), "n_timesteps": self.steps}
 
     def run(self, trial: FrozenTrial, seed: int) -> Run:
         """

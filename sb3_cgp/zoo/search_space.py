@@ -1,5 +1,6 @@
 """Optuna's search space for CGP, and the conversion of its parameters into hyperparameters."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,12 +32,14 @@ def sample_cgp_params(trial: "optuna.Trial", n_actions: int, n_envs: int, additi
     :param trial: Optuna's trial
     :param n_actions: number of action dimensions, for the action noise
     :param n_envs: number of environments; unused
-    :param additional_args: ``using_her_replay_buffer``, a bool, and ``her_kwargs``, the arguments of a ``HerReplayBuffer``
+    :param additional_args: ``using_her_replay_buffer``, a bool; ``her_kwargs``, the arguments of a ``HerReplayBuffer``; and
+        optionally ``fixed``, hyperparameters that replace sampled ones
     :return: arguments for CGP
     """
     from rl_zoo3.hyperparams_opt import sample_her_params
 
-    one_minus_gamma = trial.suggest_float("one_minus_gamma", 0.0001, 0.03, log=True)
+    fixed = additional_args.get("fixed", {})
+    trial.suggest_float("one_minus_gamma", 0.0001, 0.03, log=True)
     # From 2**5=32 to 2**9=512: the time of a gradient step grows with batch size times samples
     trial.suggest_int("batch_size_pow", 5, 9)
     trial.suggest_float("learning_rate", 1e-5, 0.002, log=True)
@@ -68,28 +71,34 @@ def sample_cgp_params(trial: "optuna.Trial", n_actions: int, n_envs: int, additi
         her_kwargs = {}
 
     # From the trial's parameters alone, as under `--trial-id`, so that the two agree
-    hyperparams = convert_cgp_params(trial.params)
+    hyperparams = convert_cgp_params(trial.params, fixed)
     hyperparams["action_noise"] = _action_noise(hyperparams.pop("noise_type"), hyperparams.pop("noise_std"), n_actions)
     # Display the values of the hyperparameters
-    trial.set_user_attr("gamma", 1 - one_minus_gamma)
-    for name in ("batch_size", "gradient_steps", "cem_samples", "cem_elites"):
-        trial.set_user_attr(name, hyperparams[name])
+    for name in ("gamma", "batch_size", "gradient_steps", "cem_samples", "cem_elites", "policy_loss", "policy_training"):
+        trial.set_user_attr(name, fixed.get(name, hyperparams[name]))
     # The user's other arguments of the HerReplayBuffer, too
     return hyperparams | her_kwargs
 
 
-def convert_cgp_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+def convert_cgp_params(sampled_params: dict[str, Any], fixed: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """
     Convert a trial's parameters into hyperparameters of a YAML file, which has ``noise_type`` and ``noise_std``.
 
+    Fixed hyperparameters leave the parameters as they are, since Optuna allows no other choices in a study that has begun.
+
     :param sampled_params: the parameters that :func:`sample_cgp_params` suggested
-    :return: hyperparameters
+    :param fixed: hyperparameters that the caller will put in place of these
+    :return: hyperparameters that are valid together with the fixed ones: a sampled variant that these contradict gives way to
+        the one most like it, the elites are a fraction of fixed samples, and the samples are not fewer than fixed elites
     """
     from rl_zoo3.hyperparams_opt import convert_offpolicy_params
 
+    # Values that are no numbers are refused when a model is made
+    counts = {name: value for name, value in (fixed or {}).items() if isinstance(value, int)}
     hyperparams = convert_offpolicy_params(sampled_params)
-    hyperparams.update(VARIANTS[hyperparams.pop("variant")])
-    hyperparams["cem_samples"] = 2 ** hyperparams.pop("cem_samples_pow")
+    hyperparams.update(_fitting_variant(hyperparams.pop("variant"), fixed or {}))
+    sampled = 2 ** hyperparams.pop("cem_samples_pow")
+    hyperparams["cem_samples"] = counts.get("cem_samples", max(sampled, counts.get("cem_elites", 1)))
     # At least one, and never more than there are samples
     hyperparams["cem_elites"] = max(round(hyperparams.pop("cem_elite_fraction") * hyperparams["cem_samples"]), 1)
     if hyperparams["noise_type"] == "none":
@@ -99,6 +108,20 @@ def convert_cgp_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     if her_kwargs:
         hyperparams["replay_buffer_kwargs"] = her_kwargs
     return hyperparams
+
+
+def _fitting_variant(sampled: str, fixed: Mapping[str, Any]) -> dict[str, str | None]:
+    """
+    Return the hyperparameters of a variant that fixed ones do not contradict.
+
+    :param sampled: the sampled variant
+    :param fixed: the fixed hyperparameters
+    :return: the variant that has most in common with the sampled one, itself if it fits; itself, too, if none fits
+    """
+    # `inference=None` follows the policy's loss, and contradicts none
+    given = {name: value for name, value in fixed.items() if (name, value) != ("inference", None)}
+    fitting = [each for each in VARIANTS.values() if all(given.get(name, each[name]) == each[name] for name in each)]
+    return max(fitting, key=lambda each: len(each.items() & VARIANTS[sampled].items()), default=VARIANTS[sampled])
 
 
 def _action_noise(noise_type: str, noise_std: float, n_actions: int) -> ActionNoise:
