@@ -1,5 +1,6 @@
 """CGP models that train in a second, one of every variant."""
 
+import pytest
 import torch as th
 
 from sb3_cgp import CGP
@@ -20,6 +21,23 @@ def make_model(env="Pendulum-v1", policy="MlpPolicy", **kwargs):
     arguments["policy_kwargs"] = dict(net_arch=[16])
     arguments.update(kwargs)
     return CGP(policy, env, **arguments)
+
+
+def step_without_learning(model):
+    """
+    Take an environment step and a gradient step in which no networks but the averaged ones change.
+
+    :return: the observations for which actions are selected, in this order: in acting, for bootstrapping, in the policy's loss
+    """
+    acting, batches, sample = th.as_tensor(model._last_obs.copy()), [], model.replay_buffer.sample
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            model.replay_buffer, "sample", lambda *args, **kwargs: batches.append(sample(*args, **kwargs)) or batches[0]
+        )
+        patch.setattr(model, "_descend", lambda name, loss: None)
+        model.learn(1, reset_num_timesteps=False)
+    (batch,) = batches
+    return acting, batch.next_observations, batch.observations
 
 
 def same_parameters(model, other):

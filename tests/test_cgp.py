@@ -1,11 +1,12 @@
 """CGP as a user of SB3 meets it: its defaults, variants, acting, seeding, and its policies."""
 
 import inspect
+from copy import deepcopy
 
 import numpy as np
 import pytest
 import torch as th
-from small_models import VARIANTS, make_model, same_parameters
+from small_models import VARIANTS, make_model, same_parameters, step_without_learning
 from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -84,6 +85,29 @@ def test_rollouts_act_by_cem_while_predict_asks_the_actor():
     last_observation = model.policy.obs_to_tensor(model._last_obs)[0]
     actor_action = model.policy.unscale_action(model.actor(last_observation).detach().numpy())
     assert np.allclose(model.predict(model._last_obs)[0], actor_action)
+
+
+def test_bootstrap_actions_are_selected_on_the_target_critic_and_the_others_on_the_critic():
+    asked = []
+
+    class Asking(CEM):
+        """Keeps the values of actions of 0."""
+
+        def select(self, score, n_states, action_dim, device="cpu"):
+            asked.append(score(th.zeros(n_states, 1, action_dim)))
+            return super().select(score, n_states, action_dim, device)
+
+    arguments = dict(cem_dtype="float32", learning_rate=1e-2, tau=0.1, diagnostics=False)
+    model = make_model(**arguments, policy_kwargs=dict(net_arch=[16], selector=Asking())).learn(71)
+    critic, target = model.critic, deepcopy(model.critic_target)
+    asked.clear()
+    observations = step_without_learning(model)
+    for values, of_choice, selects, other in zip(
+        asked, observations, (critic, target, critic), (target, critic, target), strict=True
+    ):
+        zeros = th.zeros(len(of_choice), 1)
+        assert th.allclose(values, selects.q1_forward(of_choice, zeros), atol=1e-5)
+        assert not th.allclose(values, other.q1_forward(of_choice, zeros), atol=1e-2)
 
 
 def test_eval_callback_scores_the_actor_within_learn(tmp_path):

@@ -4,17 +4,14 @@ import math
 
 import pytest
 import torch as th
+from scores import first_pairs
 
 from sb3_cgp.selectors import ActorCEM
 
 
 def oracle_actor_cem(score, draws, n_elites, proposal, n_around, std):
-    """CEM from the actor for one state of one dimension, a loop for every line: the best action of all samples."""
-    centre = math.atanh(max(min(proposal, 0.99), -0.99))
-    pairs = [(centre, proposal)]
-    for index, draw in enumerate(draws[0][1:]):
-        sample = centre + std * draw if index < n_around else draw
-        pairs.append((sample, math.tanh(sample)))
+    """CEM from the actor for one state of one dimension, a loop for every line: the best action of all samples, and elites."""
+    pairs = first_pairs(draws[0], proposal, n_around, std)
     for iteration in range(len(draws)):
         pairs.sort(key=lambda pair: score(pair[1]), reverse=True)
         elites = [sample for sample, _ in pairs[:n_elites]]
@@ -27,8 +24,9 @@ def oracle_actor_cem(score, draws, n_elites, proposal, n_around, std):
     return best[1], elites
 
 
+@pytest.mark.parametrize("result", ["best", "mean"])
 @pytest.mark.parametrize("iterations", [1, 2, 4])
-def test_is_a_loop_for_every_line_of_it(iterations):
+def test_is_a_loop_for_every_line_of_it(iterations, result):
     def score(action):
         return math.sin(9 * action) - action**2
 
@@ -36,12 +34,13 @@ def test_is_a_loop_for_every_line_of_it(iterations):
     th.manual_seed(1)
     draws = [th.randn(4, 12, 1) for _ in range(iterations)]
     th.manual_seed(1)
-    selection = ActorCEM(iterations, 12, 3, actor_fraction=0.4, actor_std=0.1).select(
+    selection = ActorCEM(iterations, 12, 3, result, actor_fraction=0.4, actor_std=0.1).select(
         lambda actions: (9 * actions).sin().sub(actions.square()).squeeze(2), 4, 1, proposals=proposals
     )
     for state in range(4):
         of_state = [draw[state, :, 0].tolist() for draw in draws]
-        action, elites = oracle_actor_cem(score, of_state, 3, proposals[state].item(), 5, 0.1)
+        best, elites = oracle_actor_cem(score, of_state, 3, proposals[state].item(), 5, 0.1)
+        action = best if result == "best" else math.tanh(sum(elites) / 3)
         assert selection.actions[state].item() == pytest.approx(action, abs=1e-5)
         assert selection.elites[state, :, 0].tolist() == pytest.approx(elites, abs=1e-4)
 

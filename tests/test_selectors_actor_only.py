@@ -1,9 +1,12 @@
 """The actor alone as the selector, with which CGP is SB3's TD3 or DDPG."""
 
+import math
+
 import numpy as np
 import pytest
 import torch as th
 from environments import Doubles
+from scores import Seen
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.noise import NormalActionNoise
 
@@ -14,6 +17,16 @@ from sb3_cgp.selectors.policies import CGPPolicy
 
 def noise():
     return NormalActionNoise(np.zeros(2), 0.1 * np.ones(2))
+
+
+def test_selects_the_first_proposal_as_it_is_whose_value_before_tanh_is_clipped_at_that_of_099():
+    proposals = th.tensor([[[0.5, -0.9], [0.1, 0.2]], [[0.0, -0.989], [0.3, 0.4]], [[1.0, -0.995], [0.5, 0.6]]])
+    seen = Seen()
+    selection = ActorOnly().select(seen, 3, 2, proposals=proposals)
+    assert th.equal(selection.actions, proposals[:, 0])
+    expected = [[math.atanh(max(min(action, 0.99), -0.99)) for action in state[0]] for state in proposals.tolist()]
+    assert th.allclose(selection.elites, th.tensor(expected).unsqueeze(1), atol=1e-4)
+    assert seen.actions == []
 
 
 @pytest.mark.parametrize(

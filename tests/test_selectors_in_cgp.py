@@ -1,11 +1,13 @@
 """Selectors besides the paper's CEM in a training of CGP."""
 
 import math
+from copy import deepcopy
 
 import oracles
 import pytest
 import torch as th
 from scores import Seen
+from small_models import step_without_learning
 from torch import nn
 
 import sb3_cgp.core.policies as core_policies
@@ -84,35 +86,57 @@ def test_a_search_near_the_actor_is_accepted_where_the_actor_can_learn(arguments
     assert any(not th.equal(*pair) for pair in zip(before, model.actor.parameters(), strict=True))
 
 
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (
+            lambda: make_model(cem_start="actor").policy.selector,
+            "ActorCEM(iterations=2, samples=64, elites=6, result='best', actor_fraction=0.5, actor_std=0.3)",
+        ),
+        (
+            lambda: make_model(
+                cem_start="actor", cem_iterations=3, cem_samples=20, cem_elites=5, cem_result="mean",
+                cem_actor_fraction=0.25, cem_actor_std=0.1
+            ).policy.selector,
+            "ActorCEM(iterations=3, samples=20, elites=5, result='mean', actor_fraction=0.25, actor_std=0.1)",
+        ),
+        (ActorCEM, "ActorCEM(iterations=1, samples=16, elites=6, result='best', actor_fraction=0.5, actor_std=0.3)"),
+        (MPPI, "MPPI(iterations=2, samples=64, elites=6, result='mean', temperature=0.5, start=None)"),
+        (ActorStart, "ActorStart(fraction=0.5, std=0.3)"),
+    ],
+    ids=["CGP's defaults", "CGP's arguments", "ActorCEM", "MPPI", "ActorStart"],
+)  # fmt: skip
+def test_a_selector_is_what_it_was_asked_to_be_and_else_what_the_published_numbers_were_made_with(make, expected):
+    assert repr(make()) == expected
+
+
 def record_proposals(model):
-    """Replace a model's selector by one that keeps the proposals that it is given."""
-    given = []
+    """Keep the proposals that a model's selector is given."""
+    given, select = [], model.policy.selector.select
 
-    class Recording(ActorCEM):
-        def select(self, score, n_states, action_dim, device="cpu", proposals=None):
-            given.append(None if proposals is None else proposals.clone())
-            return super().select(score, n_states, action_dim, device, proposals)
+    def recording(*args, proposals):
+        given.append(proposals.squeeze(1).clone())
+        return select(*args, proposals=proposals)
 
-    model.policy.selector = Recording(1, 16, 6)
+    model.policy.selector.select = recording
     return given
 
 
-def test_acting_and_the_loss_start_from_the_actor_and_bootstrap_actions_from_the_averaged_one():
-    model = make_model(**LIGHT, tau=0.5).learn(70)
+@pytest.mark.parametrize(
+    "arguments",
+    [LIGHT, dict(policy_kwargs=dict(net_arch=[16], selector=MPPI(1, 16, start=ActorStart())))],
+    ids=["CEM", "MPPI"],
+)
+def test_acting_and_the_loss_start_from_the_actor_and_bootstrap_actions_from_the_averaged_one(arguments):
+    model = make_model(**arguments, actor_learning_rate=1e-2, tau=0.1, diagnostics=False).learn(71)
+    actor, averaged = model.actor, deepcopy(model.actor_target)
     given = record_proposals(model)
-    model.policy.set_training_mode(False)
-    batch = model.replay_buffer.sample(16)
-    with th.no_grad():
-        actor, averaged = model.actor(batch.observations), model.actor_target(batch.next_observations)
-    assert not th.allclose(model.actor_target(batch.observations), actor)
-    model.policy.select_actions(batch.observations, model.critic)
-    model.policy.select_actions(batch.next_observations, model.critic_target)
-    assert th.equal(given[0][:, 0], actor)
-    assert th.equal(given[1][:, 0], averaged)
-    given.clear()
-    # One environment step and one gradient step: acting, bootstrap actions, the policy's loss
-    model.learn(1, reset_num_timesteps=False)
-    assert [proposals.shape for proposals in given] == [(1, 1, 1), (16, 1, 1), (16, 1, 1)]
+    observations = step_without_learning(model)
+    for proposals, of_choice, proposes, other in zip(
+        given, observations, (actor, averaged, actor), (averaged, actor, averaged), strict=True
+    ):
+        assert th.equal(proposals, proposes(of_choice))
+        assert not th.allclose(proposals, other(of_choice), atol=1e-2)
 
 
 def test_the_actor_proposes_in_evaluation_mode_and_keeps_its_mode():

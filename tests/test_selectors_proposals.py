@@ -1,4 +1,4 @@
-"""CEM from the actor's action: its first samples."""
+"""CEM and MPPI from the actor's action: their first samples."""
 
 import math
 
@@ -57,14 +57,24 @@ def test_more_proposals_than_samples():
     assert seen.actions[0].shape == (3, 4, 1)
 
 
-def test_without_share_of_the_prior_and_without_std_the_actors_action_comes_back():
+@pytest.mark.parametrize(
+    "selector",
+    [
+        ActorCEM(1, 16, 6, actor_fraction=1.0, actor_std=0.0),
+        ActorCEM(3, 16, 6, actor_fraction=1.0, actor_std=0.0),
+        # Its later iterations draw all samples anew, before tanh
+        MPPI(1, 16, 6, "best", start=ActorStart(1.0, 0.0)),
+    ],
+    ids=str,
+)
+def test_without_share_of_the_prior_and_without_std_the_actors_action_comes_back(selector):
     proposals = th.rand(7, 1, 3) * 2 - 1
-    # All samples have the same value but for rounding: the proposal itself is the best
+    proposals[0], proposals[1] = 1.0, -1.0
+    # All samples have the same value but for rounding, or saturation: the proposal itself is the best
     nearest = Seen(lambda actions: -(actions - proposals).abs().sum(dim=2))
-    for iterations in (1, 3):
-        selection = ActorCEM(iterations, 16, 6, actor_fraction=1.0, actor_std=0.0).select(nearest, 7, 3, proposals=proposals)
-        assert th.equal(selection.actions, proposals[:, 0])
-        assert th.allclose(selection.std, th.zeros(7, 3), atol=1e-6)
+    selection = selector.select(nearest, 7, 3, proposals=proposals)
+    assert th.equal(selection.actions, proposals[:, 0])
+    assert th.allclose(selection.std, th.zeros(7, 3), atol=1e-6)
 
 
 def test_without_proposals_it_is_the_papers_cem():
