@@ -68,8 +68,8 @@ def check_tuning(tuning: Tuning) -> None:
         raise SweepError("The tuned configurations", "", f"no model can be made: {_in_words(errors[0])}") from errors[0]
     if errors:
         print(
-            f"Warning: of {N_SAMPLES} sampled configurations, {len(errors)} cannot be trained ({_in_words(errors[0])}). Trials "
-            "with such ones fail, and count for --trials; to avoid them, set the hyperparameter that contradicts by --set, too",
+            f"Warning: of {N_SAMPLES} sampled configurations, {len(errors)} cannot be trained ({_in_words(errors[0])}). "
+            "Trials of such ones fail, and count for --trials: set the hyperparameter that contradicts by --set, too, to avoid them",
             file=sys.stderr,
         )
 
