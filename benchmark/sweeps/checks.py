@@ -69,7 +69,7 @@ def check_tuning(tuning: Tuning) -> None:
     if errors:
         print(
             f"Warning: of {N_SAMPLES} sampled configurations, {len(errors)} cannot be trained ({_in_words(errors[0])}). "
-            "Trials of such ones fail, and count for --trials: to avoid them, set the hyperparameter that contradicts by --set",
+            "Trials of these fail, and count for --trials: to avoid them, set the hyperparameter that contradicts by --set",
             file=sys.stderr,
         )
 
