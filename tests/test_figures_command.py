@@ -35,6 +35,31 @@ def test_mistakes_are_named(folder: Path, tmp_path: Path, capsys: pytest.Capture
     assert "'0' is not an integer >= 1" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("study.json", "{}", r"study\.json lacks title, .*tasks, .*\. Move it away"),
+        ("study.json", "[]", r"study\.json must hold a mapping in JSON, and holds \[\]"),
+        ("study.json", '{"title":\n', r"study\.json, line 2, is no JSON: Expecting value\. Move it away"),
+        ("study.json", "\udcff", r"study\.json is no text in UTF-8\. Move it away"),
+        ("study.json", None, r"study\.json is missing; give the command of its sweep again"),
+        ("runs.jsonl", '{"seed": 1}\n', r"runs\.jsonl, line 1, is no record of a run: .*'experiment'.*Move it away"),
+        ("../../runtime/runtime.json", "", r"runtime\.json, line 1, is no JSON: .*benchmark\.runtime"),
+    ],
+)
+@pytest.mark.usefixtures("undrawn")
+def test_a_damaged_file_is_named_with_a_remedy(tmp_path: Path, file: str, content: str | None, message: str) -> None:
+    results = tmp_path / "sweeps"
+    make(tmp_path / "runtime")
+    study = write_study(make(results / "e1"), runs(score, BASELINES[:1]))
+    if content is None:
+        (study / file).unlink()
+    else:
+        (study / file).write_bytes(content.encode(errors="surrogateescape"))
+    with pytest.raises(SystemExit, match=f"^Error: .*{message}"):
+        main(["--folder", str(results), "--repetitions", "20"])
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_all_studies_of_a_folder(folder: Path, tmp_path: Path) -> None:
     for study in ("axis", "axes"):

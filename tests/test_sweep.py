@@ -252,6 +252,30 @@ def test_exported_runs_are_not_overwritten_by_fewer(tmp_path, ledger, monkeypatc
     assert (folder / "runs.jsonl").read_bytes() == before
 
 
+def finished(tmp_path, ledger, monkeypatch):
+    """The command line of a sweep that has ended, and the folder of its results."""
+    end_both(ledger)
+    storage = f"sqlite:///{tmp_path}/studies.db"
+    monkeypatch.setattr("benchmark.sweeps.execution.forget_ended", lambda *args: None)
+    folder = export_study("mine", storage, tmp_path / "results")
+    return [*SMALL, "--study", "mine", "--storage", storage, "--results", str(tmp_path / "results")], folder
+
+
+def test_damaged_runs_are_named_and_written_again_once_moved_away(tmp_path, ledger, monkeypatch):
+    command, folder = finished(tmp_path, ledger, monkeypatch)
+    monkeypatch.setattr("benchmark.sweep.figures", lambda *args: "page")
+    runs, whole = folder / "runs.jsonl", (folder / "runs.jsonl").read_bytes()
+    runs.write_bytes(whole[:-30])
+    with pytest.raises(SystemExit, match=rf"^Error: {runs}, line 2, is no JSON: .*Move it away, and give the command"):
+        main(command)
+    runs.rename(folder / "damaged")
+    main(command)
+    assert runs.read_bytes() == whole
+    (folder / STUDY).write_text("{}")
+    with pytest.raises(SystemExit, match=rf"^Error: {folder / STUDY} lacks title, .*configurations\. Move it away"):
+        main([*command, "--adopt"])
+
+
 def test_a_study_says_all_that_it_was_ever_given(tmp_path, ledger):
     more, _ = of_command_line(*SMALL[:-2], "--methods", "SAC", "CGP-Online", "--results", str(tmp_path))
     ledger.open(more, describe(more, ["more"], "cpu"))

@@ -6,11 +6,21 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from benchmark.common.files import parse_json, read_json
 from sb3_cgp.common.files import write_atomically
 
 # The files of a study's folder: its records, and its description
 RUNS = "runs.jsonl"
 STUDY = "study.json"
+# The keys of a description in all versions
+DESCRIBED = (
+    *("title", "experiment", "axes", "steps", "evaluation_interval", "evaluation_episodes", "settings_in_words"),
+    *("methods", "tasks", "seeds", "runs_planned", "commands"),
+)
+REWRITE = (
+    "give the command of its sweep again, which writes it anew from the study's storage; without that, move the folder away"
+)
+REMEDY = f"Move it away, and {REWRITE}."
 # Of the evaluation of a final model, the same for all runs on a task. The seed is far from those that people train with:
 # rl_zoo3 gives a run's own seed to the environments of its training.
 FINAL_EPISODES, EVALUATION_SEED = 20, 10_000
@@ -101,5 +111,26 @@ def read_records(folder: Path) -> list[Record]:
     :param folder: the study's folder
     :return: the runs
     :raises FileNotFoundError: if it holds none
+    :raises ValueError: if one is damaged; it names the file, the line and the remedy
     """
-    return [Record(**json.loads(line)) for line in (folder / RUNS).read_text().splitlines()]
+    path, records = folder / RUNS, []
+    for number, line in enumerate(path.read_bytes().splitlines(), start=1):
+        fields = parse_json(line, path, remedy=REMEDY, first_line=number)
+        try:
+            records.append(Record(**fields))
+        except TypeError as error:
+            raise ValueError(f"{path}, line {number}, is no record of a run: {error}. {REMEDY}") from error
+    return records
+
+
+def read_description(folder: Path, *further: str) -> dict[str, Any]:
+    """
+    Read the description of a study.
+
+    :param folder: the study's folder
+    :param further: keys that it must have beside those of all versions
+    :return: the description
+    :raises FileNotFoundError: if it has none
+    :raises ValueError: if it is damaged; it names the file and the remedy
+    """
+    return read_json(folder / STUDY, (*DESCRIBED, *further), REMEDY)

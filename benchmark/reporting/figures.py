@@ -1,7 +1,6 @@
 """The figures of studies, which follow from their runs, and the page that shows them with the commands that draw them."""
 
 import itertools
-import json
 import re
 import sys
 import zlib
@@ -10,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmark.common.files import read_json
 from benchmark.common.records import RUNS
 from benchmark.reporting.claims import NOT_THE_PAPERS, findings
 from benchmark.reporting.commands import FIGURES_ONLY, FOLDER, command_line, with_results_folder
@@ -64,8 +64,7 @@ def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPE
     :param repetitions: number of bootstrap samples
     :param with_page: whether the page is written; if not, an earlier one stays
     :return: the page
-    :raises FileNotFoundError: if a folder holds no study
-    :raises ValueError: if two have the same name
+    :raises ValueError: if a folder holds no study, a file of it is damaged, or two have the same name
     """
     studies = [read_study(folder) for folder in folders]
     names = [study.name for study in studies]
@@ -143,9 +142,11 @@ def read_runtime(out: Path) -> dict[str, Any] | None:
 
     :param out: the folder of the page
     :return: the record in the folder beside it; None without one
+    :raises ValueError: if it is damaged; it names the file and the remedy
     """
     path = out.parent / "runtime/runtime.json"
-    return json.loads(path.read_text()) if path.is_file() else None
+    remedy = "Move it away, and measure anew by `python -m benchmark.runtime`."
+    return read_json(path, ["methods"], remedy) if path.is_file() else None
 
 
 def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmark.common.records import STUDY, Record, read_records
+from benchmark.common.records import REWRITE, Record, read_description, read_records
 
 FAILURE_RULE = (
     "A run that failed counts with the lowest return that any evaluation of any run on its task reached, and its learning "
@@ -120,12 +120,13 @@ def read_study(folder: Path) -> Study:
 
     :param folder: its folder
     :return: the study
-    :raises FileNotFoundError: if it is no study's folder
+    :raises ValueError: if it is no study's folder, or a file of it is damaged; it names the file and the remedy
     """
     try:
-        return Study(folder.resolve().name, folder, json.loads((folder / STUDY).read_text()), read_records(folder))
+        return Study(folder.resolve().name, folder, read_description(folder), read_records(folder))
     except FileNotFoundError as error:
-        raise FileNotFoundError(f"{folder} is no folder of a study: {Path(error.filename).name} is missing") from error
+        missing = Path(error.filename).name
+        raise ValueError(f"{folder} is no folder of a study: {missing} is missing; {REWRITE}") from error
 
 
 def settings_in_words(settings: dict[str, Any]) -> str:

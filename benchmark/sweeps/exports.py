@@ -1,6 +1,5 @@
 """The runs of a study as small text files, for figures and for a repository."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,7 @@ from optuna.trial import TrialState
 
 from benchmark.common.files import write_json
 from benchmark.common.provenance import processors_of_commands
-from benchmark.common.records import RUNS, STUDY, Record, read_records, write_records
+from benchmark.common.records import RUNS, STUDY, Record, read_description, read_records, write_records
 from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.study_trials import owned
 from benchmark.sweeps.study_view import StudyView
@@ -62,6 +61,7 @@ def check_no_run_is_lost(folder: Path, study: StudyView) -> None:
     :param folder: the study's folder of results
     :param study: the study
     :raises SweepError: if it lacks some
+    :raises ValueError: if the file of the runs is damaged; it names the file, the line and the remedy
     """
     exported = {record.key for record in read_records(folder)} if (folder / RUNS).is_file() else set()
     lacking = exported - {key for key, trial in owned(study.trials()).items() if trial.state is not TrialState.WAITING}
@@ -79,10 +79,11 @@ def ended_runs(folder: Path, description: dict[str, Any]) -> tuple[list[Record],
     :param description: the sweep's description
     :return: the runs, and the commands that trained them
     :raises SweepError: if they were trained with other settings; it names one
+    :raises ValueError: if a file is damaged; it names the file and the remedy
     """
     if not (folder / STUDY).is_file():
         return [], []
-    was = json.loads((folder / STUDY).read_text())
+    was = read_description(folder, "configurations")
     for key in ("steps", "evaluation_interval", "evaluation_episodes", "configurations"):
         now = description[key]
         if key == "configurations":
