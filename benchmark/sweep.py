@@ -126,13 +126,13 @@ def main(argv: Sequence[str] | None = None) -> None:
             print(f"Checking the hyperparameters of {sweep.name}", file=sys.stderr, flush=True)
             check_values(sweep)
         folders = [execute(sweep, storage, study, args, argv) for sweep, study in zip(sweeps, studies, strict=True)]
+        print(f"The page is {figures(sorted({*folders, *study_folders(args.results)}), args.results)}")
     except ValueError as error:
         sys.exit(f"Error: {error}")
     except STORAGE_ERRORS as error:
         sys.exit(f"Error: the storage does not answer: {reason_of(error)}. When it does, the same command continues.")
     except KeyboardInterrupt:
         sys.exit(128 + signal.SIGINT)
-    print(f"The page is {figures(sorted({*folders, *study_folders(args.results)}), args.results)}")
 
 
 if __name__ == "__main__":

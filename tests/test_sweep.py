@@ -276,6 +276,15 @@ def test_damaged_runs_are_named_and_written_again_once_moved_away(tmp_path, ledg
         main([*command, "--adopt"])
 
 
+def test_another_studys_incomplete_folder_ends_a_finished_sweep_with_its_name(tmp_path, ledger, monkeypatch):
+    command, folder = finished(tmp_path, ledger, monkeypatch)
+    other = folder.parent / "other"
+    other.mkdir()
+    (other / "runs.jsonl").touch()
+    with pytest.raises(SystemExit, match=rf"^Error: {other} is no folder of a study: study.json is missing; give"):
+        main(command)
+
+
 def test_a_study_says_all_that_it_was_ever_given(tmp_path, ledger):
     more, _ = of_command_line(*SMALL[:-2], "--methods", "SAC", "CGP-Online", "--results", str(tmp_path))
     ledger.open(more, describe(more, ["more"], "cpu"))
