@@ -11,15 +11,17 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import optuna
 import torch as th
 
 from benchmark.common.arguments import add_epilog, count, device_name
 from benchmark.sweeps.groups import add_population, population_size
 from benchmark.sweeps.processes import add_heartbeats, check_grace
 from benchmark.sweeps.signals import handle_as_worker
-from benchmark.sweeps.storages import open_storage, patiently
+from benchmark.sweeps.storages import STORAGE_ERRORS, open_storage, patiently, reason_of
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.worker_loop import execute_runs
+from sb3_cgp.common.rules import require
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -47,6 +49,22 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
+def open_ledger(args: argparse.Namespace) -> Ledger:
+    """
+    Open the study that the command line names.
+
+    :param args: the command line
+    :return: the study
+    :raises ValueError: if an option is wrong, or the storage holds no such study
+    """
+    check_grace(args.beat, args.grace)
+    storage = patiently(open_storage, args.storage, create=False)
+    names = patiently(optuna.get_all_study_names, storage)
+    allowed = f"a study that benchmark.sweep has begun in this storage, which holds {', '.join(names) or 'none'}"
+    require(args.study in names, "study", args.study, allowed)
+    return Ledger(storage, args.study, args.grace)
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """
     Train the runs of a study.
@@ -54,10 +72,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     :param argv: the command line; None for that of the process
     """
     args = parse(sys.argv[1:] if argv is None else argv)
-    check_grace(args.beat, args.grace)
     handle_as_worker(args.parent)
     th.set_num_threads(args.threads)
-    ledger = Ledger(patiently(open_storage, args.storage), args.study, args.grace)
+    try:
+        ledger = open_ledger(args)
+    except ValueError as error:
+        sys.exit(f"Error: {error}")
+    except STORAGE_ERRORS as error:
+        sys.exit(f"Error: the storage does not answer: {reason_of(error)}. When it does, the same command continues.")
     size = population_size(args.population, args.device)
     execute_runs(ledger, args.logs, f"{socket.gethostname()}:{os.getpid()}", args.beat, args.parent, args.device, size)
 

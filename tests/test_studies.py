@@ -105,5 +105,12 @@ def test_the_workers_command_trains_all_runs_of_a_study(tmp_path, monkeypatch):
     assert {trial.user_attrs[WORKER] for trial in ledger.trials()} == {f"{socket.gethostname()}:{os.getpid()}"}
     here = processor(machine(th.device("cpu")))
     assert all(record.processors == [here] for record in ledger.records())
-    with pytest.raises(ValueError, match="must be more than two heartbeats"):
-        benchmark.worker.main(["--study", "study", "--storage", url, "--logs", str(tmp_path), "--grace", "1"])
+    for options, message in [
+        (["--grace", "1"], "Error: The value of `grace` is 1.0, but must be more than two heartbeats"),
+        (["--study", "stduy"], "Error: The value of `study` is 'stduy', but must be a study .* which holds study"),
+        (["--storage", "nonsense"], "Error: The value of `storage` is 'nonsense', but must be a database's URL"),
+        (["--storage", f"sqlite:///{tmp_path}/x.db"], f"`storage` is .*, but there is no file {tmp_path}/x.db: give"),
+    ]:
+        with pytest.raises(SystemExit, match=message):
+            benchmark.worker.main(["--study", "study", "--storage", url, "--logs", str(tmp_path), *options])
+    assert not list(tmp_path.glob("x.db*"))

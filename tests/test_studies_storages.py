@@ -76,6 +76,15 @@ def test_a_storage_that_is_none(url, message):
         open_storage(url)
 
 
+def test_a_missing_file_is_only_created_on_demand(tmp_path):
+    url = f"sqlite:///{tmp_path}/folder/studies.db"
+    with pytest.raises(ValueError, match=f"there is no file {tmp_path}/folder/studies.db: give the --storage"):
+        open_storage(url, create=False)
+    assert list(tmp_path.iterdir()) == []
+    open_storage(url)
+    assert open_storage(url, create=False).get_all_studies() == []
+
+
 def test_processes_that_make_a_database_at_once(tmp_path):
     for attempt in range(3):
         url = f"sqlite:///{tmp_path}/{attempt}/studies.db"

@@ -44,9 +44,10 @@ def export_study(name: str, storage_url: str, results: Path) -> Path:
     :param results: the folder of all studies' results
     :return: the study's own folder, in it
     :raises KeyError: if there is no such study
+    :raises ValueError: if there is no such storage
     :raises SweepError: if the folder holds runs that the study lacks, which would be lost
     """
-    study = StudyView(open_storage(storage_url), name)
+    study = StudyView(open_storage(storage_url, create=False), name)
     folder = results / name
     check_no_run_is_lost(folder, study)
     write_json(folder / STUDY, study.description())

@@ -29,13 +29,15 @@ SQLITE_TIMEOUT = 120
 TABLES_TIMEOUT = 5.0
 
 
-def open_storage(url: str) -> BaseStorage:
+def open_storage(url: str, create: bool = True) -> BaseStorage:
     """
     Open a storage, and create it if it is a file of SQLite that is missing.
 
     :param url: SQLAlchemy's URL of a database, or ``grpc://host:port`` of Optuna's proxy in front of one
+    :param create: whether a missing file is created; if not, it is refused
     :return: the storage
-    :raises ValueError: if it is neither, the database's driver is not installed, or the database is in memory
+    :raises ValueError: if it is neither, the database's driver is not installed, the database is in memory, or its file is
+        missing and not to be created
     """
     parts = urlsplit(url)
     if parts.scheme == "grpc":
@@ -47,6 +49,13 @@ def open_storage(url: str) -> BaseStorage:
     database = _read_url(url)
     if database.get_backend_name() != "sqlite":
         return get_storage(_open_database(database, {"pool_pre_ping": True}))
+    # SQLite's own URLs of files are left to it
+    path = Path(database.database or "")
+    if not create and not path.exists() and "uri" not in database.query:
+        raise ValueError(
+            f"The value of `storage` is {url!r}, but there is no file {path}: give the --storage of the command that has "
+            "begun the study, from the same folder"
+        )
     return get_storage(_open_sqlite(database))
 
 
