@@ -5,7 +5,6 @@ Test CGP on environments of other packages, each installed from PyPI into a virt
 """
 
 import argparse
-import json
 import os
 import shutil
 import sys
@@ -17,7 +16,7 @@ import torch as th
 from packaging.utils import canonicalize_name
 
 from benchmark.common.arguments import add_epilog, count, output_folder
-from benchmark.common.files import write_json
+from benchmark.common.files import read_json, write_json
 from benchmark.common.provenance import commit, machine
 from benchmark.compatibility.checking import check
 from benchmark.compatibility.installing import install, read_pins
@@ -71,6 +70,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     :param argv: the command line; None for that of the process
     """
     args = parse(sys.argv[1:] if argv is None else argv)
+    try:
+        # Before an installation of minutes
+        read_all(args.folder)
+    except ValueError as error:
+        sys.exit(f"Error: {error}")
     for package in PACKAGES:
         record = args.folder / f"{package.name}.json"
         earlier = tested(package, record)
@@ -95,9 +99,22 @@ def tested(package: Package, record: Path) -> set[str]:
     :param package: the package
     :param record: the file of its record
     :return: their ids, without those that are not declared any more
+    :raises ValueError: if the record is damaged; it names the file and the remedy
     """
-    known = json.loads(record.read_text())["environments"] if record.is_file() else {}
+    known = read_record(record)["environments"] if record.is_file() else {}
     return {environment.id for environment in package.environments} & known.keys()
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """
+    Read the record of a package.
+
+    :param path: its file
+    :return: the record
+    :raises ValueError: if it is damaged; it names the file and the remedy
+    """
+    remedy = "Move it away, and give the same command again, which tests the package anew."
+    return read_json(path, ("package", "environments"), remedy)
 
 
 def test(package: Package, args: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -149,14 +166,24 @@ def other_versions(versions: dict[str, str]) -> dict[str, list[str]]:
     return {name: [version, pins[name]] for name, version in public.items() if version != pins.get(name, version)}
 
 
+def read_all(folder: Path) -> list[dict[str, Any]]:
+    """
+    Read the records of all packages.
+
+    :param folder: the folder of the records
+    :return: the records, by file
+    :raises ValueError: if one is damaged; it names the file and the remedy
+    """
+    return [read_record(path) for path in sorted(folder.glob("*.json"))]
+
+
 def write_page(args: argparse.Namespace) -> None:
     """
     Write the page of all records that the folder has.
 
     :param args: the command line
     """
-    records = (json.loads(path.read_text()) for path in sorted(args.folder.glob("*.json")))
-    text = page({record["package"]: record for record in records})
+    text = page({record["package"]: record for record in read_all(args.folder)})
     write_atomically(args.page or args.folder / "environments.md", text.encode())
 
 

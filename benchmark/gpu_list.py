@@ -163,8 +163,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     unknown = sorted(set(args.only or []) - {step.name for step in steps})
     if unknown:
         sys.exit(f"Error: --only {' '.join(unknown)}: must be of {', '.join(step.name for step in steps)}")
-    if args.list:
+    try:
         record = read_record(args)
+    except ValueError as error:
+        sys.exit(f"Error: {error}")
+    if args.list:
         for step in steps:
             print(f"{step.name}: {step.recorded(record).get('state', 'to do')}: {' '.join(step.command[1:])}")
         return

@@ -6,7 +6,6 @@ same command continues: points that are there are kept.
 """
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from typing import Any
 import torch as th
 
 from benchmark.common.arguments import count
-from benchmark.common.files import write_json
+from benchmark.common.files import read_json, write_json
 from benchmark.common.measuring import TIME_OVER, add_environment, measuring_parser
 from benchmark.common.provenance import conditions
 from benchmark.speed.card_estimates import estimate_all
@@ -79,7 +78,10 @@ def kept(args: argparse.Namespace, given: dict[str, Any]) -> dict[str, Any]:
     path = args.folder / "population.json"
     if not path.exists():
         return {"points": []}
-    record = json.loads(path.read_text())
+    try:
+        record = read_json(path, ("points", "machine", *RECORDED), "Move it away, and give the same command again.")
+    except ValueError as error:
+        sys.exit(f"Error: {error}")
 
     def way(record: dict[str, Any]) -> list[Any]:
         hardware = [record["machine"][name] for name in ("cpu", "gpu", "device", "torch_threads")]

@@ -52,6 +52,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     argv = sys.argv[1:] if argv is None else argv
     args = parse(argv)
+    try:
+        # Before runs of hours
+        read_records(args.folder)
+    except ValueError as error:
+        sys.exit(f"Error: {error}")
     th.set_num_threads(args.threads)
     train_missing(args, argv)
     text = markdown(read_records(args.folder))

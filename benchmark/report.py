@@ -47,6 +47,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         import_packages(split_env_id(args.env)[0])
         run = run_in(args.run) if args.run else find_run(args.folder, args.algo, args.env, args.exp_id)
+        for name in ("args.yml", "config.yml"):
+            # Before anything is evaluated
+            run.read_yaml(name)
     except (FileNotFoundError, ImportError, ValueError) as error:
         sys.exit(f"Error: {error}")
     print(summary(run, report(run, args.episodes, args.seed)))

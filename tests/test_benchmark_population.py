@@ -211,6 +211,13 @@ def test_points_that_are_there_are_kept_and_a_time_limit_ends_between_points(tmp
         population.main([*options, "--seed", "5"])
 
 
+def test_a_damaged_record_is_named(tmp_path):
+    path = tmp_path / "population.json"
+    path.write_text("{}")
+    with pytest.raises(SystemExit, match=rf"^Error: {path} lacks points, machine, .*Move it away"):
+        population.main([*TINY.split(), "--folder", str(tmp_path)])
+
+
 def test_estimates_and_measurements_of_separate_calls_are_kept(tmp_path, small):
     """With and without estimates, in both orders."""
     options = [*TINY.split(), "--folder", str(tmp_path)]

@@ -48,6 +48,24 @@ def test_command_refuses_other_settings_in_one_folder(tmp_path, capsys):
     assert "holds runs with units=8: choose another --folder for units=16" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "line 1, is no JSON: Expecting value. Move it away"),
+        ("{}", "lacks method, seed, settings, points. Move it away"),
+        ('{"method": "A", "seed": 0, "settings": {}, "points": []}', "has the method 'A', which must be one of CGP-1"),
+        ('{"method": "TD3", "seed": 0, "settings": {"unit": 3}, "points": []}', "holds runs with unit=3"),
+    ],
+)
+def test_command_names_a_damaged_record(content, message, tmp_path, capsys):
+    (tmp_path / "Pendulum-v1_TD3_seed0.json").write_text(content)
+    with pytest.raises(SystemExit):
+        command.main([*TINY, "--folder", str(tmp_path)])
+    error = capsys.readouterr().err
+    assert f"argument --folder: {tmp_path}" in error
+    assert message in error
+
+
 def test_command_refuses_episodes_too_short_for_a_return(tmp_path, capsys):
     with pytest.raises(SystemExit):
         command.main([*TINY, "--folder", str(tmp_path), "--episode-steps", "458"])

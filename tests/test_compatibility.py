@@ -102,6 +102,14 @@ def test_named_packages_are_tested_and_the_others_kept(stand_in, fakes, tmp_path
         run(stand_in, tmp_path, "--packages", "unknown")
 
 
+def test_a_damaged_record_is_named_before_anything_is_installed(stand_in, fakes, tmp_path):
+    path = tmp_path / "records" / "of mine.json"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("{}")
+    with pytest.raises(SystemExit, match=rf"^Error: {path} lacks package, environments\. Move it away"):
+        run(stand_in, tmp_path)
+
+
 def test_a_crash_at_the_end_of_a_process_is_not_one_of_the_training(stand_in, tmp_path):
     environment = Environment("aborts", "env = None")
     for _ in range(2):

@@ -189,6 +189,13 @@ def test_the_time_limit_stops_a_step_which_goes_on_in_the_next_call(tmp_path, mo
     assert set(states(tmp_path).values()) == {DONE}
 
 
+def test_a_damaged_record_is_named(tmp_path):
+    path = tmp_path / "gpu_list.json"
+    path.write_text("[]")
+    with pytest.raises(SystemExit, match=rf"^Error: {path} must hold a mapping in JSON.*Move it away"):
+        gpu_list.main(["--folder", str(tmp_path)])
+
+
 def test_only_named_steps_are_done(tmp_path, monkeypatch):
     fake = Fake(monkeypatch)
     do_steps(STEPS, arguments(tmp_path, "--only", "e6"), fake)

@@ -78,6 +78,14 @@ def test_runs_are_recorded_as_they_end_and_not_repeated(tmp_path, monkeypatch):
     assert "| 5, 6 |" in unpadded((tmp_path / "precision.md").read_text())
 
 
+def test_a_damaged_record_is_named_before_any_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(precision_runs, "run", lambda *args: pytest.fail("it trains"))
+    path = tmp_path / "Pendulum-v1_float32_seed0.json"
+    path.touch()
+    with pytest.raises(SystemExit, match=rf"^Error: {path}, line 1, is no JSON: .*Move it away"):
+        precision.main(["--folder", str(tmp_path)])
+
+
 def test_a_run_trains_with_its_data_type_and_compares_elites(tmp_path, monkeypatch):
     monkeypatch.setattr(elites, "STATES", 50)
     monkeypatch.setattr(precision_runs, "EPISODES", 2)

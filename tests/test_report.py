@@ -180,6 +180,22 @@ def test_a_folder_without_a_run_or_a_model_is_refused(tmp_path: Path) -> None:
         report.main(["--run", str(tmp_path)])
 
 
+@pytest.mark.parametrize(
+    ("content", "reason"), [("", "is damaged"), ("- [a", "is damaged"), ("[1, 2]", "is damaged"), ("{env: a}", "lacks algo")]
+)
+def test_damaged_settings_are_named(tmp_path: Path, content: str, reason: str) -> None:
+    (tmp_path / ENV).mkdir()
+    settings, config = (tmp_path / ENV / name for name in ("args.yml", "config.yml"))
+    (tmp_path / f"{ENV}.zip").touch()
+    settings.write_text(content)
+    with pytest.raises(SystemExit, match=rf"Error: {settings} {reason}.* or name another run"):
+        report.main(["--run", str(tmp_path)])
+    settings.write_text(f"{{algo: cgp, env: {ENV}}}")
+    config.write_text("[a")
+    with pytest.raises(SystemExit, match=f"Error: {config} is damaged"):
+        report.main(["--run", str(tmp_path)])
+
+
 def test_missing_run_names_the_folder_and_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match=r"No run of cgp on Pendulum-v1 in .*cgp: .*`make train ALGO=cgp") as error:
         report.main(["--folder", str(tmp_path)])

@@ -1,7 +1,6 @@
 """Steps of a list: commands that are executed in order within a time limit, and recorded, so that a later call continues."""
 
 import argparse
-import json
 import signal
 import subprocess
 import time
@@ -10,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmark.common.files import write_json
+from benchmark.common.files import read_json, write_json
 from benchmark.common.measuring import TIME_OVER
 
 ROOT = Path(__file__).parents[2]
@@ -140,6 +139,8 @@ def read_record(args: argparse.Namespace) -> dict[str, Any]:
 
     :param args: the command line of ``benchmark.gpu_list``
     :return: the record, empty if there is none
+    :raises ValueError: if it is damaged; it names the file and the remedy
     """
     path = args.folder / RECORD
-    return dict(json.loads(path.read_text())) if path.exists() else {}
+    remedy = "Move it away, and give the same command again: each step goes on from what it has written."
+    return read_json(path, remedy=remedy) if path.exists() else {}

@@ -39,12 +39,31 @@ class Run:
 
         :param name: ``config.yml`` (the hyperparameters) or ``args.yml`` (the command line)
         :return: the file's content; empty without such a file
+        :raises ValueError: if the file is damaged; it names the file and the remedy
         """
         path = self.settings_folder / name
-        if not path.is_file():
-            return {}
+        return read_settings(path) if path.is_file() else {}
+
+
+def read_settings(path: Path, *keys: str) -> dict[str, Any]:
+    """
+    Read a YAML file that rl_zoo3 saved about a run.
+
+    :param path: the file
+    :param keys: keys that it must have
+    :return: the file's content
+    :raises ValueError: if the file is damaged; it names the file and the remedy
+    """
+    remedy = "restore it from a copy, or name another run"
+    try:
         # rl_zoo3 writes OrderedDicts and tuples, which only the unsafe loader reads, as rl_zoo3 does itself
-        return dict(yaml.load(path.read_text(), Loader=yaml.UnsafeLoader))
+        settings = dict(yaml.load(path.read_text(), Loader=yaml.UnsafeLoader))
+    except (yaml.YAMLError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged: {remedy}. It is no mapping in YAML: {error}") from error
+    missing = [key for key in keys if key not in settings]
+    if missing:
+        raise ValueError(f"{path} lacks {', '.join(missing)}: {remedy}")
+    return settings
 
 
 def find_run(folder: str, algo: str, env_id: str, exp_id: int = 0) -> Run:
@@ -58,6 +77,7 @@ def find_run(folder: str, algo: str, env_id: str, exp_id: int = 0) -> Run:
     :return: the run
     :raises FileNotFoundError: if there is no such run, it has no final model, or it is on another environment, which has the
         same name in rl_zoo3's folders
+    :raises ValueError: if the run's ``args.yml`` is damaged; it names the file and the remedy
     """
     env_name = EnvironmentName(env_id)
     runs = Path(folder) / algo
@@ -88,6 +108,7 @@ def run_in(folder: Path) -> Run:
     :param folder: the run's folder
     :return: the run
     :raises FileNotFoundError: if it is not a run's folder, or has no final model
+    :raises ValueError: if the run's ``args.yml`` is damaged; it names the file and the remedy
     """
     settings = next(folder.glob("*/args.yml"), None)
     if settings is None:
@@ -95,5 +116,5 @@ def run_in(folder: Path) -> Run:
     model_path = folder / f"{settings.parent.name}.zip"
     if not model_path.is_file():
         raise FileNotFoundError(f"No trained model in {folder}: wait until its training has ended")
-    args = yaml.load(settings.read_text(), Loader=yaml.UnsafeLoader)
+    args = read_settings(settings, "algo", "env")
     return Run(args["algo"], EnvironmentName(args["env"]), folder, model_path)

@@ -1,7 +1,6 @@
 """Runs that train with CEM in float32 or in bfloat16, a record of each."""
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ from typing import Any
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from benchmark.common.files import file_name, write_json
+from benchmark.common.files import file_name, read_json, write_json
 from benchmark.common.provenance import conditions
 from benchmark.common.records import EVALUATION_SEED
 from benchmark.common.zoo import read_entry, shortened_warm_up
@@ -72,8 +71,10 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
 
     :param folder: the folder of the records
     :return: the records, by task, data type and seed
+    :raises ValueError: if one is damaged; it names the file and the remedy
     """
-    records = [json.loads(path.read_text()) for path in folder.glob("*_seed*.json")]
+    remedy = "Move it away, and give the same command again, which trains its run anew."
+    records = [read_json(path, ("env", "dtype", "seed"), remedy) for path in folder.glob("*_seed*.json")]
     return sorted(records, key=lambda record: (record["env"], record["dtype"], record["seed"]))
 
 

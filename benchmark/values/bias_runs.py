@@ -1,19 +1,21 @@
 """Runs that measure the bias of a critic along the training, a record of each."""
 
 import argparse
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmark.common.files import file_name, write_json
+from benchmark.common.files import file_name, read_json, write_json
 from benchmark.common.provenance import conditions
 from benchmark.values.bias import BiasCallback
 from benchmark.values.methods import METHODS, make_model
 
 # The arguments that all records of a folder share, as they are compared
 SETTINGS = ("env", "units", "batch_size", "gamma", "tau", "steps", "learning_starts", "interval", "episodes", "episode_steps")
+
+# What a user can do about a damaged record
+REMEDY = "Move it away, and give the same command again, which trains its run anew."
 
 
 def run(method: str, seed: int, args: argparse.Namespace, argv: Sequence[str]) -> dict[str, Any]:
@@ -58,8 +60,16 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
 
     :param folder: the folder of the records
     :return: the records, by method, in the order of ``METHODS``, and seed
+    :raises ValueError: if one is damaged, or of an unknown method; it names the file and the remedy
     """
-    records = [json.loads(path.read_text()) for path in folder.glob("*_seed*.json")]
+    records = []
+    for path in folder.glob("*_seed*.json"):
+        record = read_json(path, ("method", "seed", "settings", "points"), REMEDY)
+        if record["method"] not in METHODS:
+            raise ValueError(
+                f"{path} has the method {record['method']!r}, which must be one of {', '.join(METHODS)}. {REMEDY}"
+            )
+        records.append(record)
     return sorted(records, key=lambda record: (list(METHODS).index(record["method"]), record["seed"]))
 
 
@@ -68,13 +78,13 @@ def check_settings(args: argparse.Namespace) -> None:
     Check that the finished runs of a folder have the settings of the command line.
 
     :param args: the command line
-    :raises ValueError: if one has other settings
+    :raises ValueError: if one has other settings, or is damaged
     """
     asked = settings(args)
     for record in read_records(args.folder):
-        other = {name: value for name, value in record["settings"].items() if value != asked[name]}
+        other = {name: value for name, value in record["settings"].items() if value != asked.get(name)}
         if other:
-            asked_in_words = ", ".join(f"{name}={asked[name]!r}" for name in other)
+            asked_in_words = ", ".join(f"{name}={asked.get(name)!r}" for name in other)
             found_in_words = ", ".join(f"{name}={value!r}" for name, value in other.items())
             raise ValueError(f"{args.folder} holds runs with {found_in_words}: choose another --folder for {asked_in_words}")
 
