@@ -16,16 +16,11 @@ from environments import Doubles, Reach
 from gymnasium import spaces
 from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
-from stable_baselines3 import TD3, HerReplayBuffer
-from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EvalCallback
-from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv
-from trainings import SMALL, Interruption, Stop, Training, assert_same, fingerprint
+from trainings import Interruption, Training, assert_same, fingerprint, interrupted
 
 from sb3_cgp import CGP
-from sb3_cgp.resumption import TrainingCheckpointCallback
-from sb3_cgp.resumption.algorithm import resumable
 from sb3_cgp.resumption.store import StateStore
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
@@ -173,65 +168,6 @@ def test_10_000_steps_straight_and_stopped(tmp_path, case):
     assert_same(fingerprint(stopped, stopped.run(*stops)), fingerprint(straight, straight.run()))
 
 
-def interrupted(folder, stop=47, **case):
-    """Train until the stop."""
-    training = Training(folder, **case)
-    with pytest.raises(Interruption):
-        training.learn(training.make_model(), stop)
-    return training
-
-
-def parameters(model):
-    return th.cat([parameter.detach().flatten() for parameter in model.policy.parameters()])
-
-
-def test_without_callbacks_states_go_on_being_saved(tmp_path):
-    interrupted(tmp_path)
-    model = CGP.resume(tmp_path / "state", make_vec_env("Pendulum-v1"))
-    assert model.num_timesteps == 40
-    model.learn(75)
-    assert model.num_timesteps == 75
-    resumed = CGP.resume(tmp_path / "state", make_vec_env("Pendulum-v1"))
-    assert resumed.num_timesteps == 75
-    assert th.equal(parameters(resumed), parameters(model))
-    # A finished training has nothing to do, and can be made longer
-    assert th.equal(parameters(resumed.learn(75)), parameters(model))
-    longer = CGP.resume(tmp_path / "state", make_vec_env("Pendulum-v1")).learn(90)
-    assert (longer.num_timesteps, longer._n_updates) == (90, 70)
-
-
-def test_second_trainings_go_on_to_their_own_end(tmp_path):
-    def train(folder, stop):
-        model = CGP("MlpPolicy", make_vec_env("Pendulum-v1", seed=1), policy_kwargs=dict(net_arch=[8]), **SMALL)
-        checkpoint = TrainingCheckpointCallback(10, folder)
-        model.learn(50, callback=checkpoint)
-        with pytest.raises(Interruption) if stop else warnings.catch_warnings():
-            model.learn(60, callback=[checkpoint, Stop(stop)], reset_num_timesteps=False)
-        return model
-
-    expected = train(tmp_path / "straight", None)
-    train(tmp_path / "state", 73)
-    model = CGP.resume(tmp_path / "state", make_vec_env("Pendulum-v1")).learn(60, reset_num_timesteps=False)
-    assert model.num_timesteps == expected.num_timesteps == 110
-    assert th.equal(parameters(model), parameters(expected))
-
-
-def test_the_states_of_another_training_are_not_overwritten(tmp_path):
-    interrupted(tmp_path)
-    before = sorted((tmp_path / "state").rglob("*"))
-    with pytest.raises(ValueError, match=r"`path` is '.*state', but must be a folder without the states of another training"):
-        Training(tmp_path).run()
-    assert sorted((tmp_path / "state").rglob("*")) == before
-
-
-def test_a_training_that_ended_in_the_middle_of_a_step_leaves_the_last_whole_one(tmp_path):
-    training = Training(tmp_path, save_freq=10)
-    stop = CheckpointCallback(1, str(tmp_path))
-    stop._on_step = lambda: stop.num_timesteps < 47
-    training.make_model().learn(90, callback=[TrainingCheckpointCallback(10, tmp_path / "state"), stop])
-    assert CGP.resume(tmp_path / "state", training.make_env(1)).num_timesteps == 40
-
-
 def test_an_environment_that_cannot_be_restored_begins_an_episode(tmp_path):
     case = dict(env=lambda: Opaque(Reach()), policy="MultiInputPolicy", normalises=False)
     training = interrupted(tmp_path, **case)
@@ -257,108 +193,6 @@ def test_no_return_crosses_the_gap_where_an_environment_was_not_restored(tmp_pat
     with pytest.warns(UserWarning, match="The environment's state was not saved"):
         training.learn(model, None)
     assert model.replay_buffer.dones[last].all()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (dict(save_freq=0), "`save_freq` is 0, but must be"),
-        (dict(save_freq=2.5), "`save_freq` is 2.5, but must be"),
-        (dict(save_freq=1, keep=0), "`keep` is 0, but must be"),
-    ],
-)
-def test_bad_arguments_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        TrainingCheckpointCallback(**arguments)
-
-
-def test_without_a_path_a_warning_says_that_nothing_is_saved(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    handler = signal.getsignal(signal.SIGTERM)
-    model = CGP("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[8]), **SMALL)
-    with pytest.warns(UserWarning, match="No state of the training will be saved, as `path` is None"):
-        model.learn(40, callback=TrainingCheckpointCallback(10))
-    assert list(tmp_path.iterdir()) == []
-    assert signal.getsignal(signal.SIGTERM) is handler
-
-
-def test_an_environment_that_did_not_fit_can_be_replaced(tmp_path):
-    training = interrupted(tmp_path)
-    expected = training.learn(CGP.resume(tmp_path / "state", training.make_env(7)), None)
-    interrupted(tmp_path / "again")
-    model = CGP.resume(tmp_path / "again" / "state", DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
-    with pytest.raises(ValueError, match=r"`env` is .*, but must be what the state was saved from"):
-        model.learn(120)
-    model.set_env(training.make_env(8))
-    model.learn(120)
-    assert (model.num_timesteps, model._n_updates) == (120, 100)
-    assert th.equal(parameters(model), parameters(expected))
-
-
-def test_the_environment_may_be_given_by_its_name(tmp_path):
-    model = CGP("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[8]), **SMALL)
-    model.learn(30, callback=TrainingCheckpointCallback(10, tmp_path / "state"))
-    assert CGP.resume(tmp_path / "state", "Pendulum-v1").learn(40).num_timesteps == 40
-
-
-def test_what_does_not_fit_is_refused(tmp_path):
-    training = interrupted(tmp_path)
-    with pytest.raises(ValueError, match=r"`env.num_envs` is 3, but must be 1, as was saved"):
-        CGP.resume(tmp_path / "state", make_vec_env("Pendulum-v1", n_envs=3))
-    with pytest.raises(ValueError, match=r"`buffer_size` is 20, but must be at least 40"):
-        CGP.resume(tmp_path / "state", training.make_env(1), buffer_size=20)
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        CGP.resume(tmp_path / "nowhere", training.make_env(1))
-
-
-@pytest.mark.parametrize("value", [True, False])
-@pytest.mark.parametrize("algorithm", [CGP, resumable(TD3)], ids=["CGP", "TD3"])
-def test_a_reset_of_the_environment_is_no_argument_of_resume(algorithm, value, tmp_path):
-    arguments = dict(policy_kwargs=dict(net_arch=[8]), learning_starts=5, buffer_size=20, batch_size=4, device="cpu")
-    algorithm("MlpPolicy", "Pendulum-v1", **arguments).learn(8, callback=TrainingCheckpointCallback(8, tmp_path))
-    message = (
-        rf"`force_reset` is {value}, but `{algorithm.__name__}.resume` takes no such argument\. Leave it out: .* restores"
-    )
-    with pytest.raises(TypeError, match=message):
-        algorithm.resume(tmp_path, "Pendulum-v1", force_reset=value)
-    # The other arguments of `load`; the folder is not locked
-    model = algorithm.resume(tmp_path, "Pendulum-v1", custom_objects={}, print_system_info=False, batch_size=3)
-    assert model.batch_size == 3
-
-
-def test_hindsight_with_the_environments_information_is_refused_before_it_trains(tmp_path):
-    arguments = SMALL | dict(replay_buffer_class=HerReplayBuffer, replay_buffer_kwargs=dict(copy_info_dict=True))
-    model = CGP("MultiInputPolicy", make_vec_env(Reach), **arguments)
-    with pytest.raises(ValueError, match="`copy_info_dict` is True, but must be False where the training is saved"):
-        model.learn(40, callback=TrainingCheckpointCallback(10, tmp_path))
-    assert model.num_timesteps == 0
-
-
-def test_callbacks_that_are_gone_are_named(tmp_path):
-    class Counting(Stop):
-        counted = 0
-
-        def _on_step(self):
-            self.counted += 1
-            return super()._on_step()
-
-    training = Training(tmp_path)
-    model = CGP("MlpPolicy", training.make_env(1), policy_kwargs=dict(net_arch=[8]), **SMALL)
-    callbacks = CallbackList([TrainingCheckpointCallback(10, tmp_path / "state"), Counting(47)])
-    with pytest.raises(Interruption):
-        model.learn(60, callback=callbacks)
-    model = CGP.resume(tmp_path / "state", training.make_env(1))
-    with pytest.warns(UserWarning, match="Counting was among the callbacks, and is not now: what it counted is lost"):
-        model.learn(60)
-
-
-def test_callbacks_keep_their_new_arguments_and_their_old_counters(tmp_path):
-    training = interrupted(tmp_path)
-    evaluation = EvalCallback(training.make_env(3), eval_freq=1_000, n_eval_episodes=1, verbose=0)
-    model = CGP.resume(tmp_path / "state", training.make_env(1))
-    model.learn(60, callback=[TrainingCheckpointCallback(10, tmp_path / "state"), evaluation])
-    assert (evaluation.eval_freq, evaluation.n_eval_episodes, evaluation.n_calls) == (1_000, 1, 60)
-    assert evaluation.best_mean_reward == max(map(np.mean, training.evaluation.evaluations_results))
 
 
 SCRIPT = """

@@ -4,6 +4,7 @@ import random
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -164,3 +165,11 @@ def assert_same(found, expected):
     assert found.keys() == expected.keys()
     for name, value in expected.items():
         np.testing.assert_array_equal(found[name], value, err_msg=name, strict=True)
+
+
+def interrupted(folder, stop=47, **case):
+    """Train until the stop."""
+    training = Training(folder, **case)
+    with pytest.raises(Interruption):
+        training.learn(training.make_model(), stop)
+    return training
