@@ -2,10 +2,10 @@
 
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
+from trainings import parameters_equal
 
 from sb3_cgp import CEM, CGP, TrainingCheckpointCallback
 from sb3_cgp.selectors import MPPI, ActorCEM, ActorOnly, ActorStart
-from tests.trainings import parameters_equal
 
 ARGUMENTS = dict(learning_starts=50, batch_size=16, seed=0)
 CHANGES = {

@@ -60,6 +60,7 @@ class SelectorAlgorithm(CGP):
         is_made_here = self.policy_kwargs.get("selector") is None and selector == self._make_selector()
         super().__setattr__(name, value)
         try:
+            check_arguments(self, tuple(POLICY_LOSSES))
             self._check_arguments()
             if is_made_here:
                 self.policy.selector = self._make_selector()
@@ -75,8 +76,7 @@ class SelectorAlgorithm(CGP):
         self._choose_inference()
 
     def _check_arguments(self) -> None:
-        """Check the arguments, without those of the policy."""
-        check_arguments(self, tuple(POLICY_LOSSES))
+        """Check the arguments that the core lacks."""
         require_choice("cem_start", self.cem_start, STARTS)
         check_start(self.cem_actor_fraction, self.cem_actor_std, prefix="cem_actor_")
 
@@ -103,14 +103,15 @@ class SelectorAlgorithm(CGP):
         """Check that an actor which imitates the selector is shown other actions than its own."""
         selector = self.policy.selector
         start, samples = getattr(selector, "start", None), getattr(selector, "samples", 0)
-        if self.policy_loss != "cgp" or not isinstance(start, ActorStart) or start.leaves_others(samples):
+        if self.policy_loss != "cgp" or not isinstance(start, ActorStart):
             return
-        reason = "with policy_loss='cgp', as an actor that imitates itself learns nothing"
-        if self.cem_start != "actor":
-            require(False, "selector", selector, f"one with samples that differ from the actor's action {reason}")
-        reason = reason.replace("with", "with cem_start='actor' and", 1)
-        require(samples > 1, "cem_samples", samples, f"at least 2 {reason}")
-        require(False, "cem_actor_std", start.std, f"greater than 0, or `cem_actor_fraction` smaller, {reason}")
+        is_useful = start.leaves_others(samples)
+        reason = "policy_loss='cgp', as an actor that imitates itself learns nothing"
+        if self.cem_start == "actor":
+            require(samples > 1, "cem_samples", samples, f"at least 2 with cem_start='actor' and {reason}")
+            allowed = f"greater than 0, or `cem_actor_fraction` smaller, with cem_start='actor' and {reason}"
+            require(is_useful, "cem_actor_std", start.std, allowed)
+        require(is_useful, "selector", selector, f"one with samples that differ from the actor's action with {reason}")
 
     def _warn_of_replaced_arguments(self) -> None:
         """Warn of arguments of CEM that have no effect, as a selector of the user's replaces CEM."""

@@ -93,10 +93,11 @@ def convert_cgp_params(sampled_params: dict[str, Any], fixed: Mapping[str, Any] 
     """
     from rl_zoo3.hyperparams_opt import convert_offpolicy_params
 
+    fixed = fixed or {}
     # Values that are no numbers are refused when a model is made
-    counts = {name: value for name, value in (fixed or {}).items() if isinstance(value, int)}
+    counts = {name: value for name, value in fixed.items() if isinstance(value, int)}
     hyperparams = convert_offpolicy_params(sampled_params)
-    hyperparams.update(_fitting_variant(hyperparams.pop("variant"), fixed or {}))
+    hyperparams.update(_fitting_variant(hyperparams.pop("variant"), fixed))
     sampled = 2 ** hyperparams.pop("cem_samples_pow")
     hyperparams["cem_samples"] = counts.get("cem_samples", max(sampled, counts.get("cem_elites", 1)))
     # At least one, and never more than there are samples
