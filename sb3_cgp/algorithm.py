@@ -82,8 +82,8 @@ class CGP(
         The rest, but for the actor's action itself, is drawn from the prior.
     :param cem_actor_std: standard deviation of the samples around the actor's action, before tanh
     :param cem_dtype: data type of all layers of the critic but the last one while CEM asks it: "float32", "bfloat16", or
-        "auto", which is bfloat16 on processors that multiply it natively. Values, actions and the critic's own training
-        are float32 in any case.
+        "auto", which is bfloat16 on processors that multiply it faster than float32. Values, actions and the critic's own
+        training are float32 in any case.
     :param cuda_graphs: on a GPU, whether gradient steps and CEM's acting are recorded as CUDA graphs, and the replay buffer
         is kept on the GPU: the same computation in less time. A graph fixes the Python decisions of a user's own selector.
         Has no effect on a CPU, nor with other observations than ``Box`` or another optimizer than the fused Adam.

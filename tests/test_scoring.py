@@ -171,15 +171,19 @@ def test_bfloat16_is_close_for_any_network_and_rounds_only_relu_networks(name):
 @pytest.mark.parametrize(
     ("setting", "capabilities", "dtype"),
     [
+        ("auto", {"avx512_bf16": True, "cpu_name": "AMD EPYC"}, th.bfloat16),
         ("auto", {"avx512_bf16": True}, th.bfloat16),
+        ("auto", {"avx512_bf16": True, "amx_bf16": True, "cpu_name": "Intel Xeon"}, th.bfloat16),
         ("auto", {"avx512_bf16": False, "amx_bf16": True}, th.bfloat16),
+        # An Intel processor whose AMX the virtual machine hides
+        ("auto", {"avx512_bf16": True, "amx_bf16": False, "cpu_name": "Intel Xeon"}, th.float32),
         ("auto", {"avx512_f": True}, th.float32),
         ("auto", None, th.float32),
         ("float32", {"avx512_bf16": True}, th.float32),
         ("bfloat16", {}, th.bfloat16),
     ],
 )
-def test_auto_is_bfloat16_where_the_processor_has_it(monkeypatch, setting, capabilities, dtype):
+def test_auto_is_bfloat16_where_the_processor_multiplies_it_faster(monkeypatch, setting, capabilities, dtype):
     if capabilities is None:
         # An older PyTorch
         monkeypatch.delattr(th.cpu, "get_capabilities", raising=False)

@@ -28,7 +28,7 @@ class CGPPolicy(policies.CGPPolicy):
     :param optimizer_kwargs: Additional keyword arguments, excluding the learning rate, to pass to the optimizer.
         Adam is fused unless they say otherwise: the same step in fewer operations.
     :param cem_dtype: data type of all layers of the critic but the last one while the selector asks it: "float32",
-        "bfloat16", or "auto", which is bfloat16 on processors that multiply it natively
+        "bfloat16", or "auto", which is bfloat16 on processors that multiply it faster than float32
     :param kwargs: the same arguments by keyword
     :raises ValueError: if ``cem_dtype`` is not one of these
     """
