@@ -82,6 +82,7 @@ def find(study: str, storage: str | None, out: Path) -> Path:
     :param out: the folder of all results
     :return: its folder
     :raises FileNotFoundError: if the folder is missing, or the storage has no such study
+    :raises ValueError: if the storage does not answer
     """
     if storage is None:
         for folder in (Path(study), out / study):
@@ -90,11 +91,14 @@ def find(study: str, storage: str | None, out: Path) -> Path:
         raise FileNotFoundError(f"{study} is no folder; to take a study of that name from a storage, name it with --storage")
     # Optuna takes a second to import, and only studies of a storage need it
     from benchmark.sweeps.exports import export_study
+    from benchmark.sweeps.storages import STORAGE_ERRORS, reason_of
 
     try:
         return export_study(study, storage, out)
     except KeyError as error:
         raise FileNotFoundError(f"The storage {storage} holds no study {study}") from error
+    except STORAGE_ERRORS as error:
+        raise ValueError(f"the storage does not answer: {reason_of(error)}") from error
 
 
 if __name__ == "__main__":

@@ -93,6 +93,12 @@ def test_named_study_is_taken_from_its_storage(folder: Path, tmp_path: Path, mon
         main(["yours", *options])
 
 
+def test_a_storage_that_does_not_answer_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "notes.db").write_text("no database")
+    with pytest.raises(SystemExit, match="Error: the storage does not answer: file is not a database"):
+        main(["mine", "--storage", f"sqlite:///{tmp_path}/notes.db", "--folder", str(tmp_path / "results")])
+
+
 def test_printed_sweep_commands_name_a_folder_that_is_not_the_default(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     for out, option in (

@@ -58,6 +58,8 @@ def make_model(policy="MlpPolicy", **kwargs):
             lambda: make_model(policy_loss="qgp", policy_training="offline", policy_kwargs=dict(selector=ActorOnly())),
             "policy_training",
         ),
+        (lambda: make_model(policy_kwargs=dict(selector=MPPI)), "selector"),
+        (lambda: make_model(policy_kwargs=dict(selector="mppi")), "selector"),
         (lambda: ActorOnly().select(Seen(), 1, 1), "proposals"),
         (lambda: CGP(core_policies.CGPPolicy, "Pendulum-v1", cem_start="actor", buffer_size=10), "policy"),
     ],

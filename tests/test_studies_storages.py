@@ -8,6 +8,7 @@ import sys
 import time
 from multiprocessing import get_context
 
+import grpc
 import pytest
 from filelock import FileLock
 from ledgers import forked
@@ -19,7 +20,7 @@ from studies import GRACE, assert_each_run_once, make_sweep, pretend_to_train
 from benchmark.sweeps import storages
 from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.heartbeats import PROGRESS
-from benchmark.sweeps.storages import open_storage, patiently
+from benchmark.sweeps.storages import open_storage, patiently, reason_of
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.worker_loop import execute_runs
 
@@ -46,6 +47,12 @@ def test_patience_has_an_end(clock):
     with pytest.raises(StorageInternalError):
         patiently(call, patience=20.0)
     assert 10 < clock.now <= 20
+
+
+def test_the_reason_of_a_proxy_that_is_away_is_that_of_the_connection():
+    with grpc.insecure_channel("127.0.0.1:1") as channel, pytest.raises(grpc.RpcError) as error:
+        channel.unary_unary("/service/method")(b"", timeout=30)
+    assert "Failed to connect to remote host" in reason_of(error.value)
 
 
 def test_no_patience_with_other_errors(clock):

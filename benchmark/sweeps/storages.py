@@ -149,7 +149,9 @@ def reason_of(error: BaseException) -> str:
     :param error: one of ``STORAGE_ERRORS``
     :return: the first line of the error that Optuna's error was raised from
     """
-    return str(error.__cause__ or error).splitlines()[0]
+    cause = error.__cause__ or error
+    text = cause.details() if isinstance(cause, grpc.Call) else str(cause)
+    return str(text).splitlines()[0]
 
 
 def patiently(call: Callable[..., Result], *args: Any, patience: float = 300.0, **kwargs: Any) -> Result:

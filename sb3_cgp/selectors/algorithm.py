@@ -83,6 +83,8 @@ class SelectorAlgorithm(CGP):
     def _check_selector(self) -> None:
         """Check that the selector fits the policy and the arguments, and warn of arguments that it replaces."""
         selector = self.policy.selector
+        is_selector = not isinstance(selector, type) and callable(getattr(selector, "select", None))
+        require(is_selector, "selector", selector, "an instance with a method `select`, such as sb3_cgp.selectors.MPPI()")
         allowed = "a subclass of sb3_cgp.CGPPolicy, whose actor can propose actions to the selector"
         proposes = isinstance(self.policy, CGPPolicy)
         require(proposes or not takes_proposals(selector), "policy", self.policy_class, allowed)
