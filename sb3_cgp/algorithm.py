@@ -1,4 +1,4 @@
-"""The CGP that users get: the core's algorithm with the wings around it."""
+"""The CGP that users get: the core's algorithm with the mixins of the other packages."""
 
 import io
 import pathlib
@@ -77,16 +77,17 @@ class CGP(
     :param cem_result: "best" acts by the best sample of the last iteration (the paper), "mean" by the elites' mean
     :param cem_start: "prior" draws CEM's first samples from N(0, 1), as the paper does. "actor" takes the actor's action,
         samples around it and samples of the prior, so that fewer suffice: ``cem_start="actor", cem_iterations=1,
-        cem_samples=16``, called CGP-Light, asks the critic for an eighth of the values. It needs an actor.
+        cem_samples=16``, called CGP-Light, evaluates the critic an eighth as often. It needs an actor.
     :param cem_actor_fraction: with ``cem_start="actor"``, the share of ``cem_samples`` drawn around the actor's action.
         The rest, but for the actor's action itself, is drawn from the prior.
     :param cem_actor_std: standard deviation of the samples around the actor's action, before tanh
-    :param cem_dtype: data type of all layers of the critic but the last one while CEM asks it: "float32", "bfloat16", or
+    :param cem_dtype: data type of all layers of the critic but the last one while CEM evaluates it: "float32", "bfloat16", or
         "auto", which is bfloat16 on processors that multiply it faster than float32. Values, actions and the critic's own
         training are float32 in any case.
     :param cuda_graphs: on a GPU, whether gradient steps and CEM's acting are recorded as CUDA graphs, and the replay buffer
         is kept on the GPU: the same computation in less time. A graph fixes the Python decisions of a user's own selector.
-        Has no effect on a CPU, nor with other observations than ``Box`` or another optimizer than the fused Adam.
+        Has no effect on a CPU or with other observations than ``Box``. With another optimizer than the fused Adam, the
+        replay buffer alone is moved.
     :param policy_loss: the actor's loss: "cgp" imitates CEM, "qgp" follows the critic's gradient,
         None trains no actor, so that CEM acts at inference too
     :param policy_training: "online" trains the actor along with the critics, "offline" at the end of ``learn``
@@ -113,6 +114,7 @@ class CGP(
         Setting it to auto, the code will be run on the GPU if possible.
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     :raises ValueError: if an argument is out of its range or contradicts another one
+    :raises TypeError: if an argument is unknown, naming it and the nearest one
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -166,7 +168,7 @@ class CGP(
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        # The wings' arguments, which `_setup_model` reads
+        # The mixins' arguments, which `_setup_model` reads
         self.cem_start = cem_start
         self.cem_actor_fraction = cem_actor_fraction
         self.cem_actor_std = cem_actor_std
@@ -248,6 +250,8 @@ class CGP(
         :param progress_bar: Display a progress bar using tqdm and rich.
         :return: the trained model
         :raises ValueError: naming an argument that is wrong, or the fault of an environment
+        :raises TypeError: if an argument is unknown, naming it and the nearest one
+        :raises RuntimeError: if a worker process of a ``SubprocVecEnv`` has died
         :raises FolderInUseError: if a folder for training states is used by another training
         """
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
@@ -275,7 +279,7 @@ class CGP(
         :param batch_size: observations per gradient step, by default the model's
         :param callback: callback(s) called at every gradient step; the training stops when one returns False
         :param progress_bar: Display a progress bar using tqdm and rich.
-        :return: the model, whose ``predict`` then asks the network that ``inference`` names
+        :return: the model, whose ``predict`` then uses the network that ``inference`` names
         :raises ValueError: if there is no policy loss or no data, if observations are not normalised and the critics have
             learnt from normalised ones, or if a loss is NaN or infinite
         """
@@ -301,7 +305,7 @@ class CGP(
         """
         Load the model from a zip-file, as SB3 does.
 
-        Its replay buffer is None until ``learn`` allocates it or ``load_replay_buffer`` loads one.
+        Its replay buffer is None until ``learn`` or ``save_replay_buffer`` allocates it, or ``load_replay_buffer`` loads one.
 
         :param path: path to the file (or a file-like) where to load the agent from
         :param env: the new environment to run the loaded model on
@@ -316,6 +320,7 @@ class CGP(
         :raises ValueError: if a changed argument is out of its range or contradicts another one
         :raises TypeError: if a changed argument is none of the constructor and no attribute of the model, naming it and the
             nearest one that is allowed
+        :raises IsADirectoryError: if the path is a folder, and there is no zip-file of that name beside it
         """
         if custom_objects is not None and "learning_rate" in custom_objects:
             custom_objects = {"actor_learning_rate": None} | custom_objects
@@ -344,8 +349,8 @@ class CGP(
         Write the policy that ``predict`` uses, to be used elsewhere and loaded without pickle.
 
         ``policy.onnx`` takes a batch of observations as the environment returns them (images channels first) and returns
-        actions as the environment takes them; VecNormalize's present statistics are part of it. Its input is called
-        ``observation``, or has one input for each key of ``Dict`` observations, called by the key; its output is ``action``.
+        actions as the environment takes them; VecNormalize's present statistics are part of it. It has one input called
+        ``observation``, or, for ``Dict`` observations, one for each key, called by the key; its output is ``action``.
         Each input has the data type of its space: float64 observations are given in float64.
         ``policy.safetensors`` and ``policy.json`` are what :meth:`load_weights` reads. Both are evaluated on a few random
         observations, and compared with ``predict``, before any file is written.
@@ -355,6 +360,7 @@ class CGP(
         :raises ValueError: if the policy cannot be exported, naming the obstacle and what is allowed: an actor must
             act, on a ``Box`` or a ``Dict`` of them, by SB3's own features extractors and one of PyTorch's usual activation
             functions
+        :raises FileExistsError: if the folder is a file
         :raises ImportError: if a package of the ``export`` extra is not installed
         """
         export_policy(self, folder)
@@ -369,6 +375,7 @@ class CGP(
         :return: a policy that predicts, and cannot be trained; it takes observations that are not normalised
         :raises ValueError: if a file is damaged or of another export, or an entry is not allowed; it names the file and why
         :raises FileNotFoundError: if ``policy.json`` or ``policy.safetensors`` is missing
+        :raises NotADirectoryError: if the folder is a file
         :raises ImportError: if safetensors is not installed
         """
         return load_weights(folder)

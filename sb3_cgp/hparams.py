@@ -10,6 +10,7 @@ from stable_baselines3.common.logger import HParam, TensorBoardOutputFormat
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
+from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import constructor_argument_names
 
 # Arguments of a constructor that are no hyperparameters
@@ -83,10 +84,12 @@ class HParamsCallback(BaseCallback):
 
     :param metrics: keys of the log. A key that the training does not log is shown without a value.
     :param verbose: Verbosity level: 0 for no output
+    :raises ValueError: if ``metrics`` is a string
     """
 
     def __init__(self, metrics: Sequence[str] = ("eval/mean_reward", "rollout/ep_rew_mean"), verbose: int = 0):
         super().__init__(verbose)
+        require(not isinstance(metrics, str), "metrics", metrics, "a sequence of keys, such as ('eval/mean_reward',)")
         self.metrics = metrics
 
     def _on_training_start(self) -> None:

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from small_models import make_model
-from stable_baselines3 import TD3
+from stable_baselines3 import TD3, HerReplayBuffer
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 
 from sb3_cgp import CGPPolicy
@@ -29,6 +30,10 @@ EMPTY = spaces.Box(np.ones(1, np.float32), np.ones(1, np.float32))
         (dict(batch_size=0), "`batch_size` is 0, but must be an integer >= 1"),
         (dict(buffer_size=0), "`buffer_size` is 0, but must be an integer >= 1"),
         (dict(n_steps=0), "`n_steps` is 0, but must be an integer >= 1"),
+        (
+            dict(n_steps=3, optimize_memory_usage=True),
+            "`optimize_memory_usage` is True, but must be False with a Dict .* or `n_steps`",
+        ),
         (dict(learning_starts=-1), "`learning_starts` is -1, but must be an integer >= 0"),
         (dict(gradient_steps=-2), "`gradient_steps` is -2, but must be an integer >= -1"),
         (dict(train_freq=[1, "step"]), "`train_freq` is .*, but must be an int, or a tuple of an int and a unit"),
@@ -81,6 +86,13 @@ def test_noise_of_several_environments_is_checked_too():
     noise = VectorizedActionNoise(NormalActionNoise(np.zeros(1), -np.ones(1)), 2)
     with pytest.raises(ValueError, match="`action_noise`"):
         make_model(action_noise=noise)
+
+
+@pytest.mark.parametrize("buffer_class", [None, HerReplayBuffer])
+def test_a_memory_efficient_buffer_of_dict_observations_is_refused_by_name(buffer_class):
+    env = BitFlippingEnv(4, continuous=True)
+    with pytest.raises(ValueError, match="`optimize_memory_usage` is True, but must be False with a Dict observation space"):
+        make_model(env, "MultiInputPolicy", replay_buffer_class=buffer_class, optimize_memory_usage=True)
 
 
 @pytest.mark.parametrize("argument", ["inference", "cem_dtype"])

@@ -1,4 +1,4 @@
-"""The core alone: every wing is blocked from being imported, and the core trains as the whole package does."""
+"""The core alone: no other package but `common` can be imported, and the core trains as the whole package does."""
 
 import subprocess
 import sys
@@ -12,7 +12,7 @@ import sb3_cgp
 from sb3_cgp import CGP
 from sb3_cgp.core import cgp, policies
 
-WINGS = sorted(
+OTHERS = sorted(
     path.stem
     for path in Path(sb3_cgp.__file__).parent.iterdir()
     if (path.is_dir() or path.suffix == ".py")
@@ -28,7 +28,7 @@ import torch as th
 package = types.ModuleType("sb3_cgp")
 package.__path__ = [{package!r}]
 sys.modules["sb3_cgp"] = package
-blocked = [f"sb3_cgp.{{wing}}" for wing in {wings!r}] + ["rl_zoo3", "optuna", "filelock"]
+blocked = [f"sb3_cgp.{{other}}" for other in {others!r}] + ["rl_zoo3", "optuna", "filelock"]
 
 
 class Block:
@@ -70,20 +70,20 @@ VARIANTS = {"CGP": dict(), "QGP": dict(policy_loss="qgp", policy_delay=2), "CEM"
 
 
 def run_alone(training):
-    """Run a script in a process in which no wing can be imported, and return what it prints."""
-    script = ALONE.format(package=str(Path(sb3_cgp.__file__).parent), wings=WINGS, training=training)
+    """Run a script in a process in which no other package can be imported, and return what it prints."""
+    script = ALONE.format(package=str(Path(sb3_cgp.__file__).parent), others=OTHERS, training=training)
     return subprocess.run([sys.executable, "-c", script], check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
-def test_the_core_trains_without_any_wing_as_the_whole_package_does(tmp_path):
+def test_the_core_trains_alone_as_the_whole_package_does(tmp_path):
     """One test of all variants, as one process trains them alone."""
-    assert {"algorithm", "fast", "guards", "resumption", "export", "zoo", "diagnostics"} <= set(WINGS)
+    assert {"algorithm", "fast", "guards", "resumption", "export", "zoo", "diagnostics"} <= set(OTHERS)
     run_alone(TRAINING.format(arguments=ARGUMENTS, variants=VARIANTS, folder=str(tmp_path)))
     for variant, kwargs in VARIANTS.items():
         alone = th.load(tmp_path / f"{variant}.pt")
         assert alone, variant
 
-        # With the core's own networks and scoring, the wings change no bit
+        # With the core's own networks and scoring, the other packages change no bit
         whole = CGP(policies.CGPPolicy, policy_kwargs=dict(net_arch=[16, 16]), **ARGUMENTS, **kwargs).learn(150)
         for name, value in alone.items():
             assert th.equal(whole.policy.state_dict()[name], value), f"{variant}: {name}"
@@ -95,7 +95,7 @@ def test_the_core_trains_without_any_wing_as_the_whole_package_does(tmp_path):
             th.testing.assert_close(fast.policy.state_dict()[name], value, rtol=1e-3, atol=1e-4, msg=message)
 
 
-def test_the_core_takes_every_argument_of_the_whole_that_is_not_a_wings():
+def test_the_core_takes_every_argument_of_the_whole_that_is_its_own():
     model = cgp.CGP("MlpPolicy", policy_kwargs=dict(net_arch=[8]), tau=0.1, gamma=0.9, n_steps=3, verbose=0, **ARGUMENTS)
     assert (model.tau, model.gamma, model.replay_buffer.n_steps) == (0.1, 0.9, 3)
     action, _ = model.predict(np.zeros(3, np.float32))

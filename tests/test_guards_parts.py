@@ -82,6 +82,12 @@ def test_a_buffer_that_was_put_in_place_is_checked_when_learning_starts():
         model.learn(12)
 
 
+def test_a_model_that_was_loaded_without_an_environment_says_how_to_learn(tmp_path):
+    make_model().save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"`env` is None, but must be an environment: `GuardedTD3.load\(path, env\)`"):
+        GuardedTD3.load(tmp_path / "model").learn(12)
+
+
 def test_environments_of_another_number_are_refused_by_set_env():
     with pytest.raises(AssertionError, match=r"\(3 != 2\).* you must use `GuardedTD3.load\(path, env\)` instead"):
         make_model(2).set_env(located(3))

@@ -195,6 +195,11 @@ def test_metrics_are_an_argument(tmp_path):
     assert metrics.keys() == {"train/critic_loss"}
 
 
+def test_metrics_in_one_string_are_refused():
+    with pytest.raises(ValueError, match="`metrics` is 'eval/mean_reward', but must be a sequence of keys"):
+        HParamsCallback("eval/mean_reward")
+
+
 def test_without_tensorboard_nothing_happens(tmp_path, capsys):
     CGP("MlpPolicy", "Pendulum-v1", verbose=1, **tiny()).learn(30, HParamsCallback())
     assert "hparams" not in capsys.readouterr().out

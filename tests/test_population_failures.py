@@ -49,7 +49,10 @@ def test_a_failed_agent_stays_as_it_was_before_the_step(policy_loss):
 
 
 def test_a_population_whose_agents_have_all_failed_stops():
-    with pytest.warns(UserWarning, match="has failed"), pytest.raises(ValueError, match="All agents have failed"):
+    with (
+        pytest.warns(UserWarning, match="has failed"),
+        pytest.raises(ValueError, match=r"All agents have failed\. Agent 1: The critic loss"),
+    ):
         make(2, learning_rate=1e30).learn(2 * 80)
 
 

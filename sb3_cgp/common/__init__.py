@@ -1,1 +1,1 @@
-"""What every other part of the package uses: rules on arguments, and files that are written whole or not at all."""
+"""What the other packages share: rules on arguments, spaces, networks, random states, files written whole or not at all."""

@@ -57,6 +57,7 @@ def rollout_locals(model: OffPolicyAlgorithm, callback: BaseCallback) -> dict[st
         "continue_training": True,
         "actions": model.policy.unscale_action(scaled_actions),
         "buffer_actions": scaled_actions,
+        # SB3 keeps the last observations nowhere else
         "new_obs": model._last_obs,
         "rewards": np.zeros(model.n_envs, dtype=np.float32),
         "dones": np.zeros(model.n_envs, dtype=bool),

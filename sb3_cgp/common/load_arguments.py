@@ -41,10 +41,10 @@ def check_load_arguments(
     unknown = [name for name in arguments if name not in own | parameters]
     if not unknown:
         return
-    saved_attributes = saved_attribute_names(saved)
-    if not saved_attributes:
+    saved_names = saved_attribute_names(saved)
+    if not saved_names:
         return
-    attributes = saved_attributes | _attributes(algorithm)
+    attributes = saved_names | _attributes(algorithm)
     for name in (name for name in unknown if name not in attributes):
         public = {each for each in attributes if not each.startswith("_")}
         usage = (

@@ -8,6 +8,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -111,6 +112,12 @@ def check_off_policy_arguments(model: OffPolicyAlgorithm) -> None:
     is_valid = bool(np.all(np.asarray(getattr(noise, "_sigma", 0.0)) >= 0.0))
     require(is_valid, "action_noise", noise, "noise of standard deviation >= 0")
     # Where SB3 chooses the replay buffer, it asserts this
-    is_supported = model.n_steps == 1 or not isinstance(model.observation_space, spaces.Dict)
+    has_dict = isinstance(model.observation_space, spaces.Dict)
     allowed = "1 with a Dict observation space, for which SB3 has no n-step replay buffer"
-    require(is_supported, "n_steps", model.n_steps, allowed)
+    require(model.n_steps == 1 or not has_dict, "n_steps", model.n_steps, allowed)
+    # SB3's buffers refuse these too, one of them at the first gradient step only
+    chosen = DictReplayBuffer if has_dict else NStepReplayBuffer if model.n_steps > 1 else ReplayBuffer
+    buffer_class = model.replay_buffer_class or chosen
+    is_supported = not model.optimize_memory_usage or not issubclass(buffer_class, DictReplayBuffer | NStepReplayBuffer)
+    allowed = "False with a Dict observation space or `n_steps` above 1, for which SB3's replay buffers have no such mode"
+    require(is_supported, "optimize_memory_usage", model.optimize_memory_usage, allowed)

@@ -56,8 +56,7 @@ class CEM:
     :param iterations: number of iterations N of Algorithm 1, at least 1
     :param samples: number of samples n per state and iteration, at least 1
     :param elites: number of winners k to which the next Gaussian is fitted, from 1 to ``samples``
-    :param result: "best" returns the best sample of the last iteration, as the paper does;
-        "mean" returns the mean of the last elites, which averages out the sampling
+    :param result: "best" returns the best of the last samples (the paper), "mean" the last elites' mean, which varies less
     :raises ValueError: if an argument is out of its range
     """
 
@@ -74,9 +73,7 @@ class CEM:
         """
         Maximise ``score`` for each state by Algorithm 1, with random numbers of PyTorch's global generator.
 
-        The parameters are those of :class:`ActionSelector`. A NaN score ranks last, as `topk` would
-        rank it first.
-
+        The parameters are those of :class:`ActionSelector`. A NaN score ranks last, where `topk` would rank it first.
         :return: the selected actions (B, A) and the last elites (B, K, A)
         """
         shape = (n_states, self.samples, action_dim)

@@ -38,7 +38,7 @@ class CGP(OffPolicyAlgorithm):
 
     :param learning_rate: learning rate of the critics: a number, a function of the progress remaining (from 1 to 0), or a
         string such as ``"lin_1e-3"`` for a linear schedule that ends at 0
-    :param learning_starts: number of random steps before learning starts; with few, CGP often fails (Appendix A)
+    :param learning_starts: number of random steps before learning starts; with few, some seeds fail (Appendix A)
     :param batch_size: number of transitions in a minibatch, b
     :param cem_iterations: number of CEM's iterations
     :param cem_samples: number of actions that CEM samples per state and iteration
@@ -130,7 +130,7 @@ class CGP(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         # Not in the constructor: `load` sets the saved arguments after it, and calls this method then
-        check_arguments(self, tuple(POLICY_LOSSES))
+        self._check_arguments()
         require(issubclass(self.policy_class, CGPPolicy), "policy", self.policy_class, "a subclass of sb3_cgp.CGPPolicy")
         super()._setup_model()
         self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
@@ -138,6 +138,9 @@ class CGP(OffPolicyAlgorithm):
         if self.policy.selector is None:
             self.policy.selector = self._make_selector()
         self._choose_inference()
+
+    def _check_arguments(self) -> None:
+        check_arguments(self, tuple(POLICY_LOSSES))
 
     def _make_selector(self) -> ActionSelector:
         return CEM(self.cem_iterations, self.cem_samples, self.cem_elites, self.cem_result)

@@ -12,14 +12,10 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from sb3_cgp.common.rules import require
 from sb3_cgp.core.cgp import CGP
 from sb3_cgp.fast.cuda_graphs import RecordedFunction, Tensors, has_cuda_graphs
-from sb3_cgp.fast.recorded_optimizers import LossWatch, is_fused_adam, set_capturable, skip_step_if
+from sb3_cgp.fast.recorded_optimizers import CHECK_INTERVAL, LOSSES, LossWatch, is_fused_adam, set_capturable, skip_step_if
 
 SelfCudaGraphAlgorithm = TypeVar("SelfCudaGraphAlgorithm", bound="CudaGraphAlgorithm")
 
-# Gradient steps between two checks of the losses, each of which synchronizes with the GPU
-CHECK_INTERVAL = 100
-# Keys of the losses in the log, in the order in which a recorded step returns them
-LOSSES = ("critic_loss", "q_value", "actor_loss")
 # Attributes that hold graphs or tensors on the device, and are made anew for a copied or loaded model
 TRANSIENT = (
     "_records_steps",
@@ -141,7 +137,7 @@ class CudaGraphAlgorithm(CGP):
     def _carry_out(self, *fields: th.Tensor) -> Tensors:
         """Run the core's ``train`` for one gradient step on a minibatch, and return its losses."""
         self._loss_watch.begin_step()
-        # Neither is changed when a graph is replayed
+        # The core's `train` samples a batch and counts the step. The caller does both, as replaying a graph runs no Python.
         usual = self.replay_buffer, self._n_updates
         self.replay_buffer = _OneBatch(ReplayBufferSamples(*fields))  # type: ignore[assignment]
         losses = self._step_losses = {}

@@ -27,7 +27,7 @@ class CGPPolicy(policies.CGPPolicy):
     :param optimizer_class: The optimizer to use, ``th.optim.Adam`` by default
     :param optimizer_kwargs: Additional keyword arguments, excluding the learning rate, to pass to the optimizer.
         Adam is fused unless they say otherwise: the same step in fewer operations.
-    :param cem_dtype: data type of all layers of the critic but the last one while the selector asks it: "float32",
+    :param cem_dtype: data type of all layers of the critic but the last one while the selector evaluates it: "float32",
         "bfloat16", or "auto", which is bfloat16 on processors that multiply it faster than float32
     :param kwargs: the same arguments by keyword
     :raises ValueError: if ``cem_dtype`` is not one of these
@@ -75,6 +75,7 @@ class CGPPolicy(policies.CGPPolicy):
         for index, q_network in enumerate(critic.q_networks):
             assert isinstance(q_network, nn.Sequential)
             critic.q_networks[index] = MLP(*q_network)
+            # SB3 registers each network under this name too, which is in `state_dict`
             critic.add_module(f"qf{index}", critic.q_networks[index])
         return critic
 

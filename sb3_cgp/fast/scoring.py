@@ -76,8 +76,8 @@ def q_score(q_network: nn.Module, features: th.Tensor, dtype: th.dtype = th.floa
 
     :param q_network: maps features and actions side by side, (rows, F + A), to values, (rows, 1)
     :param features: the states' features, (B, F)
-    :param dtype: data type of the products of all layers but the last one. Everything else is float32. With few states, or a
-        network of other layers than linear ones and ReLU, everything is float32.
+    :param dtype: data type of the products of all layers but the last one. Everything else is float32. With fewer than
+        ``MANY_STATES`` states, one hidden layer, or other layers than linear ones and ReLU, everything is float32.
     :return: the scoring function, (B, N, A) -> (B, N)
     """
     if features.device.type == "cpu":

@@ -26,12 +26,12 @@ class GuardedAlgorithm(
     DummyVecEnvGuard,
     NormalisationGuard,
     PartsGuard,
-    # Looks at the first observations when the next one has reset the environment
+    # Before EpisodeGuard, whose `_setup_learn` resets the environment: the first observations are checked after that
     TransitionGuard,
     EpisodeGuard,
     NetworkGuard,
     LearningStartsGuard,
-    # Last, so that a class may name it again behind another base that overrides `_descend`
+    # Last, so that CGP can list it again after CudaGraphAlgorithm, whose `_descend` has to come first
     LossGuard,
 ):
     """

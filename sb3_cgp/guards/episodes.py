@@ -15,7 +15,7 @@ from sb3_cgp.common.episodes import end_last_episode
 from sb3_cgp.guards.observations import (
     continues_last_episode,
     copy_observations,
-    count_observations,
+    count_envs,
     innermost,
     position_of,
     same_observations,
@@ -42,7 +42,7 @@ class EpisodeGuard(OffPolicyAlgorithm):
     def _setup_learn(
         self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any, **kwargs: Any
     ) -> tuple[int, Any]:
-        if self._env_has_moved() or count_observations(self._original_last_obs) != self.n_envs:
+        if self._env_has_moved() or count_envs(self._original_last_obs) != self.n_envs:
             # SB3 resets the environment then
             self._last_obs = None
         is_reset = reset_num_timesteps or self._last_obs is None
@@ -228,7 +228,7 @@ class _StepObserver:
 
     def __init__(self, callback: BaseCallback, model: EpisodeGuard):
         self._callback, self._model = callback, model
-        # The methods that a rollout calls, without a detour
+        # Bound directly, as SB3 calls them at every step
         self.on_rollout_start, self.on_rollout_end = callback.on_rollout_start, callback.on_rollout_end
         self.on_step = callback.on_step
 

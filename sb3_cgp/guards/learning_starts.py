@@ -101,7 +101,7 @@ class LearningStartsGuard(OffPolicyAlgorithm):
         self._has_warned = True
         subject, whose = ("Nothing is learnt", "") if len(late) == len(starts) else (_nothing_is_learnt_by(late), "their ")
         beyond = _range_in_words([starts[agent] for agent in late], "")
-        # As in the sweeps of `benchmark`
+        # A tenth of the steps, as the documentation advises
         start = self._num_timesteps_at_start // len(starts)
         example = start + (last_timestep - start) // 10
         has_learnt = self._n_updates > 0 and start == 0

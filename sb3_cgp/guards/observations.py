@@ -79,7 +79,7 @@ def continues_last_episode(buffer: ReplayBuffer, observations: Any) -> bool:
     :param observations: the observations of all N environments, not normalised, (N, *shape), by key for ``Dict`` spaces
     :return: whether each episode that has not ended in the buffer's last row goes on from the observation stored there
     """
-    if buffer.size() == 0 or buffer.n_envs != count_observations(observations):
+    if buffer.size() == 0 or buffer.n_envs != count_envs(observations):
         return False
     goes_on = _array(buffer.dones[buffer.pos - 1]) == 0
     stored, row = (
@@ -99,7 +99,7 @@ def _array(values: Any) -> np.ndarray:
     return values.numpy(force=True) if isinstance(values, th.Tensor) else np.asarray(values)
 
 
-def count_observations(observations: Any) -> int | None:
+def count_envs(observations: Any) -> int | None:
     """
     Return the number of environments that observations are of.
 

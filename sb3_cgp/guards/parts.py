@@ -47,7 +47,9 @@ class PartsGuard(OffPolicyAlgorithm):
         self.replay_buffer = None
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
-        assert self.env is not None, "You must set the environment before calling learn()"
+        allowed = f"an environment: `{type(self).__name__}.load(path, env)`, or `set_env` before `learn`"
+        require(self.env is not None, "env", self.env, allowed)
+        assert self.env is not None
         self._fit_action_noise(self.env.num_envs)
         check_action_noise_shape(self.action_noise, self.action_space)
         if self.replay_buffer is not None:

@@ -64,10 +64,10 @@ def make_checks(observation_space: spaces.Space) -> list[Check]:
 
 def check_rewards(transition: Transition) -> None:
     """
-    Refuse rewards that are not one finite number for each environment.
+    Refuse rewards that are not one number for each environment.
 
     :param transition: the transition
-    :raises ValueError: naming the shape and the one that is expected, or the values
+    :raises ValueError: naming the shape and the one that is expected, or the rewards
     """
     rewards, timestep = transition.rewards, transition.timestep
     if rewards is None:

@@ -27,6 +27,7 @@ def step_chunk(remote: Connection, parent_remote: Connection, env_fns: Cloudpick
             if command == "step":
                 remote.send((*envs.step(data), envs.reset_infos))
             elif command == "reset":
+                # As `seed` and `set_options` set them; `seed` would count up from one number
                 envs._seeds, envs._options = data
                 remote.send((envs.reset(), envs.reset_infos))
             elif command == "call":

@@ -24,7 +24,7 @@ from sb3_cgp.population.networks import StackedMLP, agent_slices
 from sb3_cgp.selectors.proposals import takes_proposals
 
 # Returns the actions that agents take at their observations, (N, *shape)
-Selection = Callable[[th.Tensor], th.Tensor]
+SelectFunction = Callable[[th.Tensor], th.Tensor]
 
 
 class PopulationPolicy(BasePolicy):
@@ -45,7 +45,7 @@ class PopulationPolicy(BasePolicy):
     failed_at: th.Tensor
     _has_actor: th.Tensor
     # Carries a selection of actions out, as a CUDA graph while a population is trained; None for an ordinary call
-    recorded_selection: Callable[[Selection, th.Tensor], th.Tensor] | None = None
+    recorded_selection: Callable[[SelectFunction, th.Tensor], th.Tensor] | None = None
 
     def __init__(self, observation_space: spaces.Box, action_space: spaces.Box, agents: Sequence[CGP]):
         super().__init__(observation_space, action_space, squash_output=True)
@@ -108,7 +108,7 @@ class PopulationPolicy(BasePolicy):
         Select the actions that each agent's first critic rates highest, as ``CGPPolicy.select_actions`` does.
 
         :param features: the states' features, (N, B, F)
-        :param by_targets: whether the target critics are asked, and the averaged actors propose
+        :param by_targets: whether the target critics are evaluated, and the averaged actors propose
         :return: the actions, (N, B, A), in the scaled action space
         """
         critics, actors = (self.target_critics, self.averaged_actors) if by_targets else (self.critics, self.actors)

@@ -10,6 +10,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_cgp.fast.cuda_graphs import RecordedFunction, Tensors, has_cuda_graphs
+from sb3_cgp.fast.recorded_optimizers import CHECK_INTERVAL, LOSSES
 from sb3_cgp.fast.replay import LeanReplayAlgorithm
 from sb3_cgp.guards.arguments import ArgumentGuard
 from sb3_cgp.guards.construction import ConstructionGuard
@@ -24,13 +25,8 @@ from sb3_cgp.guards.transitions import TransitionGuard
 from sb3_cgp.guards.workers import WorkerGuard
 from sb3_cgp.population.agents import Arguments
 from sb3_cgp.population.gradient_step import AgentNumbers, GradientStep
-from sb3_cgp.population.policies import PopulationPolicy, Selection
+from sb3_cgp.population.policies import PopulationPolicy, SelectFunction
 from sb3_cgp.population.replay import sample_columns
-
-# Gradient steps between two checks of the losses on a GPU, each of which synchronizes with it
-CHECK_INTERVAL = 100
-# Keys of the losses in the log, in the order in which a gradient step returns them
-LOSSES = ("critic_loss", "q_value", "actor_loss")
 
 
 class PopulationTraining(
@@ -164,7 +160,7 @@ class PopulationTraining(
             return step(*inputs)
         return self._recorded_function(due, lambda: [*self.policy.parameters(), *self.policy.buffers()])(step, *inputs)
 
-    def _select_actions(self, select: Selection, observation: th.Tensor) -> th.Tensor:
+    def _select_actions(self, select: SelectFunction, observation: th.Tensor) -> th.Tensor:
         """Select actions in a rollout, as a CUDA graph where possible."""
         if not self._records_steps:
             return select(observation)
@@ -199,7 +195,7 @@ class PopulationTraining(
                     reason = f"The {name} loss was NaN or infinite at gradient step {step}. The {name} is as before that step."
                     self._note_failure(index, reason)
         if None not in self._failures:
-            raise ValueError(f"All agents have failed, the last one for this reason: {self._failures[-1]}")
+            raise ValueError(f"All agents have failed. Agent {len(self._failures) - 1}: {self._failures[-1]}")
 
     def _note_failure(self, index: int, reason: str) -> None:
         """Note why an agent has failed, and warn of it."""

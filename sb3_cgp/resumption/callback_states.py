@@ -61,7 +61,7 @@ def callback_states(callback: BaseCallback, training_env: VecEnv, initial: Mappi
     return [_callback_state(each, training_env, initial.get(id(each), {})) for each in iter_callbacks(callback)]
 
 
-def warn_of_unrestorable(callback: BaseCallback, training_env: VecEnv) -> list[str]:
+def callback_obstacles(callback: BaseCallback, training_env: VecEnv) -> list[str]:
     """
     Describe the environments of callbacks whose state cannot be saved.
 

@@ -8,7 +8,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_cgp.common.rules import require, require_count
 from sb3_cgp.resumption.callback_states import initial_attributes, iter_callbacks
 from sb3_cgp.resumption.model import ResumableModel
-from sb3_cgp.resumption.replay_buffers import check_replay_buffer
+from sb3_cgp.resumption.replay_buffers import check_savable
 from sb3_cgp.resumption.signals import StopSignals, end_training
 from sb3_cgp.resumption.state import gather, restore, warn_of_unsaved
 from sb3_cgp.resumption.store import StateStore
@@ -35,7 +35,7 @@ class TrainingCheckpointCallback(BaseCallback):
 
     :param save_freq: environment steps between two states, those of all environments together
     :param path: the folder for the states. With None, nothing is saved, except in rl_zoo3, where it stands for the
-        run's folder. A relative path is resolved when the callback is constructed.
+        folder ``state`` in the run's folder. A relative path is resolved when the callback is constructed.
     :param keep: how many states to keep, the newest ones
     :param verbose: Verbosity level: 0 for no output, 2 for indicating when a state is saved
     :raises ValueError: if an argument is out of its range, or, when the training starts, if the folder holds the states of
@@ -92,7 +92,7 @@ class TrainingCheckpointCallback(BaseCallback):
             return
         allowed = "set, by `set_env` or the argument `env` of `load`, where the training is saved"
         require(self.model.env is not None, "env", None, allowed)
-        check_replay_buffer(self.model._ensure_replay_buffer())
+        check_savable(self.model._ensure_replay_buffer())
         self._store = StateStore(self._folder, self.keep)
         self._store.prepare()
         self.model.hold_folder(self._folder)

@@ -24,7 +24,7 @@ UNCOPIED = ("callback", "_folder_locks", "_initial_callbacks", "_outer_signals",
 
 
 class ResumableModel(OffPolicyAlgorithm):
-    """The attributes and the two methods of a model whose training states can be saved."""
+    """The attributes and methods of a model whose training states can be saved."""
 
     # The callbacks of the training that is running
     callback: BaseCallback | None = None
@@ -32,7 +32,7 @@ class ResumableModel(OffPolicyAlgorithm):
     _initial_callbacks: Mapping[int, Fingerprints] = MappingProxyType({})
     # The loaded state, until the next `learn` has restored it
     resumption: State | None = None
-    # The manifests' digests by state file, for each folder that holds states of this training
+    # The digests of the states' manifests in each folder that holds states of this training
     saved_to: Mapping[Path, frozenset[str]] = MappingProxyType({})
     # `num_timesteps` at the start of the last call of `learn`
     _training_started_at: int = 0

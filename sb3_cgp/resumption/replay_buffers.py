@@ -71,7 +71,7 @@ def fill_replay_buffer(buffer: ReplayBuffer, state: State) -> None:
     set_plain_attributes(buffer, state["attributes"] | position)
 
 
-def check_replay_buffer(buffer: ReplayBuffer) -> None:
+def check_savable(buffer: ReplayBuffer) -> None:
     """
     Refuse a replay buffer that cannot be saved.
 

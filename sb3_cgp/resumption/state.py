@@ -18,7 +18,7 @@ from stable_baselines3.common.logger import Logger
 
 from sb3_cgp.common.episodes import end_last_episode
 from sb3_cgp.common.rules import require
-from sb3_cgp.resumption.callback_states import callback_states, restore_callbacks, warn_of_unrestorable
+from sb3_cgp.resumption.callback_states import callback_obstacles, callback_states, restore_callbacks
 from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
 from sb3_cgp.resumption.model import ResumableModel, State
 from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
@@ -110,7 +110,7 @@ def warn_of_unsaved(model: ResumableModel, callback: BaseCallback) -> None:
     """
     assert model.env is not None
     problems = obstacles(model.env)
-    found = warn_of_unrestorable(callback, model.env)
+    found = callback_obstacles(callback, model.env)
     if problems:
         consequence = "A resumed training will continue at the start of a new episode, unlike an uninterrupted one."
         found.insert(0, f"The environment's state cannot be saved. {' '.join(problems)} {consequence}")

@@ -12,7 +12,7 @@ from sb3_cgp.selectors.proposals import before_tanh
 @dataclass
 class ActorOnly:
     """
-    Selects the actor's action, and never asks the critic.
+    Selects the actor's action, and never evaluates the critic.
 
     With it, ``CGP(..., policy_loss="qgp", policy_delay=2)`` is TD3, and a comparison with CEM leaves all else equal. Its
     rollouts explore by ``action_noise`` alone, as TD3's do.

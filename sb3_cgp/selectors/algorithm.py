@@ -4,10 +4,8 @@ import warnings
 from typing import Any, ClassVar
 
 from sb3_cgp.common.rules import require, require_choice
-from sb3_cgp.core.arguments import check_arguments
 from sb3_cgp.core.cem import CEM, ActionSelector
 from sb3_cgp.core.cgp import CGP
-from sb3_cgp.core.losses import POLICY_LOSSES
 from sb3_cgp.selectors.actor_cem import ActorCEM
 from sb3_cgp.selectors.actor_only import ActorOnly
 from sb3_cgp.selectors.policies import CGPPolicy
@@ -20,10 +18,11 @@ class SelectorAlgorithm(CGP):
     """
     CGP whose CEM starts from the prior, as in the paper, or from the actor.
 
-    Acting and the policy's loss start from the actor, bootstrap actions from the averaged actor. All samples are the prior's
-    while the critics have learnt and the actor has not, as in offline training.
+    Acting and the policy's loss start from the actor, bootstrap actions from the averaged actor. While the critics have learnt
+    and the actor has not, as in ``learn`` with ``policy_training="offline"``, all samples are the prior's. The offline
+    training itself starts from the actor that it trains.
 
-    Arguments of CGP may be changed on the model, also by a callback, as SB3's may: they are checked, and take effect at once.
+    The ``changeable_arguments`` may be changed on the model, also by a callback: they are checked, and take effect at once.
     """
 
     # The arguments of the constructor
@@ -39,7 +38,6 @@ class SelectorAlgorithm(CGP):
     )
 
     def _setup_model(self) -> None:
-        self._check_arguments()
         given = self.policy_kwargs.get("actor_proposes")
         require(given is None, "policy_kwargs['actor_proposes']", given, "left out: CGP sets it when the actor is trained")
         super()._setup_model()
@@ -60,7 +58,6 @@ class SelectorAlgorithm(CGP):
         is_made_here = self.policy_kwargs.get("selector") is None and selector == self._make_selector()
         super().__setattr__(name, value)
         try:
-            check_arguments(self, tuple(POLICY_LOSSES))
             self._check_arguments()
             if is_made_here:
                 self.policy.selector = self._make_selector()
@@ -76,7 +73,7 @@ class SelectorAlgorithm(CGP):
         self._choose_inference()
 
     def _check_arguments(self) -> None:
-        """Check the arguments that the core lacks."""
+        super()._check_arguments()
         require_choice("cem_start", self.cem_start, STARTS)
         check_start(self.cem_actor_fraction, self.cem_actor_std, prefix="cem_actor_")
 

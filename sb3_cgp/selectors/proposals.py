@@ -65,7 +65,7 @@ class ActorStart:
 
         :param n_samples: number of samples, N
         :param n_proposals: number of proposals among them, P
-        :return: ``fraction`` of the samples, rounded, but for those that are proposals
+        :return: ``fraction`` of all N samples, rounded, and at most the N - P that the proposals leave
         """
         return min(round(self.fraction * n_samples), n_samples - n_proposals)
 

@@ -70,7 +70,7 @@ def register_search_space() -> None:
 
 def register_default_config() -> None:
     """
-    Make our ``cgp.yml`` the default of ``--conf-file``, and the run's folder the folder of its training states, and fill
+    Make our ``cgp.yml`` the default of ``--conf-file``, save training states to ``state`` in the run's folder, and fill
     TensorBoard's tab HParams.
 
     rl_zoo3 looks for default hyperparameters inside its own package only.
