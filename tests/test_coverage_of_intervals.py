@@ -45,6 +45,17 @@ def test_interquartile_means() -> None:
         assert share(*interval, 0.0) == pytest.approx(expected, abs=2.5), number
 
 
+@pytest.mark.parametrize("configurations", [3, 10])
+def test_interquartile_means_over_configurations(configurations: int) -> None:
+    stated = re.search(r"Over several configurations with 4 runs of each it does in (\d+) %", words(READING))
+    assert stated is not None
+    rng = np.random.default_rng(3)
+    # Each configuration's runs are drawn by themselves
+    draws = np.concatenate([drawn(rng, rng.normal(size=(SETS, 4))) for _ in range(configurations)], axis=2)
+    interval = percentile_interval(lambda runs: stats.trim_mean(runs, 0.25, axis=2), draws)
+    assert share(*interval, 0.0) == pytest.approx(int(stated[1]), abs=2.5)
+
+
 def test_differences_of_four_runs_each() -> None:
     rng, rule = np.random.default_rng(1), words(DIFFERENCES_RULE)
 
@@ -73,15 +84,24 @@ def test_differences_of_four_runs_each() -> None:
 
 def test_bootstrap_of_differences() -> None:
     rng, rule = np.random.default_rng(2), words(DIFFERENCES_RULE)
-    tasks = [
-        [drawn(rng, rng.normal(size=(SETS, 4))).mean(axis=2) for _ in range(2)] for _ in range(5)  # Means of draws by method
-    ]
-    differences = np.stack([ours - theirs for ours, theirs in tasks])
-    for found, pattern in (
-        (differences[0], r"a percentile bootstrap does in (\d+) %"),
-        (differences.mean(axis=0), r"\((\d+) % of the cases with 4 runs on each of 5 tasks\)"),
-    ):
-        low, high = np.percentile(found, [2.5, 97.5], axis=1)
-        stated = re.search(pattern, rule)
-        assert stated is not None, pattern
-        assert share(low, high, 0.0) == pytest.approx(int(stated[1]), abs=2.5)
+    ours, theirs = (drawn(rng, rng.normal(size=(SETS, 4))).mean(axis=2) for _ in range(2))
+    stated = re.search(r"a percentile bootstrap does in (\d+) %", rule)
+    assert stated is not None
+    low, high = np.percentile(ours - theirs, [2.5, 97.5], axis=1)
+    assert share(low, high, 0.0) == pytest.approx(int(stated[1]), abs=2.5)
+
+
+@pytest.mark.parametrize("scale", [1.0, 3.0])
+def test_differences_over_tasks(scale: float) -> None:
+    stated = re.search(
+        r"the same t intervals \((\d+) % of the cases with 4 runs on each of 5 tasks\)", words(DIFFERENCES_RULE)
+    )
+    assert stated is not None
+    rng = np.random.default_rng(4)
+    # By method, one of which has the larger standard deviation: (2, sets, tasks, runs)
+    runs = rng.normal(size=(2, 10 * SETS, 5, 4)) * np.array([1.0, scale])[:, None, None, None]
+    difference = (runs[0].mean(axis=2) - runs[1].mean(axis=2)).mean(axis=1)
+    variances = runs.var(axis=3, ddof=1) / 4 / 5**2
+    total = variances.sum(axis=(0, 2))
+    half = stats.t.ppf(0.975, total**2 / (variances**2 / 3).sum(axis=(0, 2))) * np.sqrt(total)
+    assert share(difference - half, difference + half, 0.0) == pytest.approx(int(stated[1]), abs=1.0)

@@ -80,11 +80,11 @@ def test_stability_is_a_count_of_runs() -> None:
 
 def test_interquartile_mean_is_that_of_rliable_for_cells_of_any_size() -> None:
     rng = np.random.default_rng(1)
-    cells = [rng.normal(size=number) for number in (4, 2, 4, 3)]
+    cells = [rng.normal(size=number) for number in (4, 6, 4, 5)]
     found = estimate(interquartile_mean, [cells], 500)
     pooled = np.concatenate(cells)
     assert found.value == pytest.approx(metrics.aggregate_iqm(pooled))
-    assert found.runs == 13
+    assert found.runs == 19
     assert found.interval is not None
     assert found.interval[0] < found.value < found.interval[1]
     lines = rng.normal(size=(5, 7))
@@ -102,14 +102,17 @@ def test_intervals_hold_the_truth_about_as_often_as_the_page_says() -> None:
 
 
 def test_runs_are_drawn_within_cells_only() -> None:
-    cells = [np.array([0.0, 0.0]), np.array([10.0, 10.0])]
+    cells = [np.zeros(4), np.full(4, 10.0)]
     assert estimate(lambda scores: scores.mean(axis=1), [cells], 50).interval == (5.0, 5.0)
 
 
-def test_single_run_has_no_interval() -> None:
-    found = estimate(interquartile_mean, [[np.array([3.0])]], 50)
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_too_few_runs_of_a_configuration_have_no_interval(number: int) -> None:
+    found = estimate(interquartile_mean, [[np.full(number, 3.0)]], 50)
     assert (found.value, found.interval) == (3.0, None)
     assert found.in_words(".1f") == "3.0 (no interval)"
+    assert estimate(interquartile_mean, [[np.arange(4.0), np.arange(float(number))]], 50).interval is None
+    assert estimate(interquartile_mean, [[np.arange(4.0)]], 50).interval is not None
 
 
 def test_estimates_repeat_and_leave_the_global_random_state_alone() -> None:

@@ -81,7 +81,7 @@ def test_one_seed_of_a_few_methods_concludes_nothing(tmp_path: Path) -> None:
     text = unpadded(figures([folder], tmp_path, 20).read_text())
     assert "**Unfinished, so that results may change: begun (3 of 24 runs).**" in text
     assert "3 of 12 so far" in text
-    assert "**Too few runs: nothing is concluded.**" in text
+    assert "**Too few runs of CGP-Online, TD3, SAC: nothing is concluded on them.**" in text
     assert "| Reacher-v5, begun | 1,000 | 0 of 12 so far | no run has ended |" in text
     assert "| 1 of 4 so far | 0 |" in text
     assert "Methods are compared from 4 runs on, which none of them has yet." in text
@@ -111,7 +111,7 @@ def test_page_names_sweeps_runs_and_failures(folder: Path) -> None:
 
 def test_probability_of_improvement_is_sure_where_it_is(folder: Path) -> None:
     text = unpadded((folder / "results.md").read_text())
-    assert "| My-PPO | 1.00 (1.00 to 1.00) | 1.00 (1.00 to 1.00) | 1.00 (1.00 to 1.00) |" in text
+    assert "| My-PPO | 1.00 (no interval) | 1.00 (no interval) | 1.00 (no interval) |" in text
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -232,3 +232,13 @@ def test_runs_at_numbers_that_are_none(tmp_path: Path) -> None:
     table = score_table([study])
     assert np.isfinite(table["score"]).all()
     assert "the final reward is no number" in figures([study.folder], tmp_path, repetitions=20).read_text()
+
+
+def test_methods_of_too_few_runs_are_named_beside_those_of_enough(tmp_path: Path) -> None:
+    """Also where another method has enough, so that its differences are judged."""
+    records = [*runs(score, ["CGP-Online", "SAC"]), *runs(score, ["TD3"], seeds=range(3))]
+    study = read_study(write_study(tmp_path / "sweep", records))
+    found = finding(study, score_table([study]), "Pendulum-v1", 20)
+    assert "higher than SAC" in found
+    assert found.endswith("**Too few runs of TD3: nothing is concluded on them.**")
+    assert "Too few" not in finding(study, score_table([study]).query("method != 'TD3'"), "Pendulum-v1", 20)

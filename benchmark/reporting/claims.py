@@ -14,10 +14,10 @@ from benchmark.reporting.estimates import (
     Estimate,
     Statistic,
     compare,
-    difference,
     estimate,
     in_common,
     interquartile_mean,
+    interquartile_mean_difference,
     interquartile_range,
 )
 from benchmark.reporting.failures import FAILURE, HIGH_LEARNING_RATE, few_steps_fail, has_high_rate, high_rate_fails
@@ -38,10 +38,11 @@ COST_MARGIN = 0.1
 RULES = f"""\
 Rewards are compared as shares of their task's range, from 0 for the lowest return of any evaluation to 1 for the best final
 reward, and averaged over tasks. Methods are compared on the configurations that all of them ran. A claim is *{SUPPORTED}*
-or *{CONTRADICTED}* if the whole 95 % interval lies on its side or on the other, *{NOT_DECIDED}* if not, or if a method has
-fewer than {FEWEST_RUNS} runs or a configuration only one; of several parts, all must be supported, and one is enough to
-contradict. The interquartile range, which measures what the paper calls spread, is that of final rewards over all
-configurations and seeds: it is 0 for a method that always fails, too, so read it with the stability curve. *At least as good*
+or *{CONTRADICTED}* if the whole 95 % interval lies on its side or on the other, *{NOT_DECIDED}* if not, or if a method or a
+configuration has fewer than {FEWEST_RUNS} runs; of several parts, all must be supported, and one is enough to contradict.
+The intervals are those of *How to read this page*, which few seeds make too narrow. The interquartile range, which measures
+what the paper calls spread, is that of final rewards over all configurations and seeds: it is 0 for a method that always
+fails, too, so read it with the stability curve. *At least as good*
 and *equal* allow {MARGIN:g} of the range, *independent* allows {COST_MARGIN:.0%}. *Fails* means that the mean loses
 {FAILURE:g} of the range against the best of the other values, chosen by these data, where all else is equal. "Best or second
 best" is among {OURS} and all methods but its variants, {IMITATED} and {RANDOM}, in studies that vary no hyperparameter,
@@ -117,11 +118,12 @@ def narrower(table: pd.DataFrame, repetitions: int) -> list[Part]:
         )
         if found is not None:
             ours, theirs = _each(usual, pair, interquartile_range)
-            text = f"range {ours:.3f} against {baseline}'s {theirs:.3f}: {_signed(found, 'narrower', 'wider')}"
+            difference = _signed(found, "narrower", "wider", ".4f")
+            text = f"range {ours:.4f} against {baseline}'s {theirs:.4f}: {difference}"
             note = ""
             if len(in_common(usual, pair)) < len(in_common(table, pair)):
                 ours, theirs = _each(table, pair, interquartile_range)
-                note = f"learning rates from {HIGH_LEARNING_RATE:g} on included, {ours:.3f} against {theirs:.3f}"
+                note = f"learning rates from {HIGH_LEARNING_RATE:g} on included, {ours:.4f} against {theirs:.4f}"
             parts.append(Part(text, judge(found, more_than=0), note))
     return parts
 
@@ -134,11 +136,10 @@ def imitation(table: pd.DataFrame, repetitions: int) -> list[Part]:
     :param repetitions: number of bootstrap samples
     :return: the comparison, if both were run
     """
-    found = compare(table, (OURS, IMITATED), difference, repetitions=repetitions)
+    found = compare(table, (OURS, IMITATED), interquartile_mean_difference, repetitions=repetitions)
     if found is None:
         return []
-    ours, theirs = _each(table, (OURS, IMITATED), interquartile_mean)
-    text = f"interquartile mean {ours:.2f} against {IMITATED}'s {theirs:.2f}: {_signed(found, 'higher', 'lower')}"
+    text = _in_words("interquartile mean", table, (OURS, IMITATED), interquartile_mean, found)
     return [Part(text, judge(found, more_than=-MARGIN))]
 
 
@@ -214,16 +215,20 @@ def _differences(
     for pair in pairs:
         found = compare(common, pair, lambda ours, theirs: statistic(ours) - statistic(theirs), repetitions=repetitions)
         if found is not None:
-            ours, theirs = _each(common, pair, statistic)
-            text = f"{name} of {pair[0]} {ours:.2f}, of {pair[1]} {theirs:.2f}: {_signed(found, 'higher', 'lower')}"
+            text = _in_words(name, common, pair, statistic, found)
             parts.append(Part(text, judge(found, **bounds)))
     return parts
 
 
-def _signed(found: Estimate, more: str, less: str) -> str:
+def _in_words(name: str, table: pd.DataFrame, pair: tuple[str, str], statistic: Statistic, found: Estimate) -> str:
+    ours, theirs = _each(table, pair, statistic)
+    return f"{name} of {pair[0]} {ours:.3f}, of {pair[1]} {theirs:.3f}: {_signed(found, 'higher', 'lower')}"
+
+
+def _signed(found: Estimate, more: str, less: str, form: str = ".3f") -> str:
     """Return a difference as text, such as "higher by 0.05 (0.01 to 0.09)", or "lower by" the opposite number."""
     word, size = (more, found) if found.value >= 0 else (less, found.negative())
-    return f"{word} by {size.in_words('.3f')}"
+    return f"{word} by {size.in_words(form)}"
 
 
 def online_better(table: pd.DataFrame, repetitions: int) -> list[Part]:
@@ -236,9 +241,10 @@ def online_better(table: pd.DataFrame, repetitions: int) -> list[Part]:
     """
     parts = []
     for kind in ("CGP", "QGP"):
-        found = compare(table, (f"{kind}-Online", f"{kind}-Offline"), difference, repetitions=repetitions)
+        pair = (f"{kind}-Online", f"{kind}-Offline")
+        found = compare(table, pair, interquartile_mean_difference, repetitions=repetitions)
         if found is not None:
-            text = f"{kind}-Online is higher than {kind}-Offline by {found.in_words('.3f')}"
+            text = _in_words("interquartile mean", table, pair, interquartile_mean, found)
             parts.append(Part(text, judge(found, more_than=0)))
     return parts
 

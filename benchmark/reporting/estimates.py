@@ -1,7 +1,6 @@
-"""Estimates with intervals, by rliable's bootstrap or Welch's t: every statistic of the results page."""
+"""Estimates with intervals, by rliable's bootstrap or Student's t: every statistic of the results page."""
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -14,7 +13,8 @@ from scipy import stats
 Statistic = Callable[..., np.ndarray]
 
 REPETITIONS = 2_000
-# Fewer runs on either side of a comparison decide nothing: even if none overlap, chance alone does so in one case of twenty
+# Fewer runs on either side of a comparison decide nothing: even if no run of three overlaps with the other three, chance alone
+# separates them in one case of ten; four and four in one of 35
 FEWEST_RUNS = 4
 
 
@@ -24,7 +24,7 @@ class Estimate:
     A number that is estimated from runs.
 
     :param value: the estimate
-    :param interval: its 95 % interval; None where a configuration has one run only
+    :param interval: its 95 % interval; None where there are too few runs for one
     :param runs: how many runs the smallest of the compared groups has
     """
 
@@ -62,10 +62,11 @@ def bootstrap(
     :param statistic: takes an array per group, (R, N, ...), of R draws of its N runs in any order, and returns (R, ...)
     :param groups: each group's cells, of shape (runs, ...)
     :param repetitions: number of bootstrap samples, R
-    :return: the statistic (...), and its 95 % interval (2, ...); None where a cell has one run only
+    :return: the statistic (...), and its 95 % interval (2, ...); None where a cell has fewer than
+        :data:`FEWEST_RUNS` runs, of which a bootstrap interval is far too narrow
     """
     value = statistic(*(np.concatenate(cells)[None] for cells in groups))[0]
-    if any(len(cell) < 2 for cells in groups for cell in cells):
+    if any(len(cell) < FEWEST_RUNS for cells in groups for cell in cells):
         return value, None
     # rliable draws within columns: cells of one size are the columns of one array
     arrays, owners = [], []
@@ -158,25 +159,26 @@ def compare(
     return estimate(mean_over_tasks, groups, repetitions)
 
 
-def welch(ours: np.ndarray, theirs: np.ndarray) -> Estimate:
+def mean_of_differences(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Estimate:
     """
-    Estimate the difference between two means, with Welch's t interval, which is right for few runs and unequal variances.
+    Estimate the mean over tasks of the difference between two means, with the t interval of Welch and Satterthwaite, which is
+    right for few runs and unequal variances.
 
-    :param ours: our runs (N)
-    :param theirs: their runs (M)
-    :return: our mean less theirs; without an interval where one side has one run only
+    :param pairs: for each task, our runs (N) and their runs (M)
+    :return: our mean less theirs, averaged over tasks; without an interval where one side has one run only
     """
-    value, runs = float(ours.mean() - theirs.mean()), min(len(ours), len(theirs))
-    if runs < 2:
-        return Estimate(value, None, runs)
-    if np.ptp(ours) == np.ptp(theirs) == 0:
-        # Without any variance, SciPy's degrees of freedom are no number
-        return Estimate(value, (value, value), runs)
-    with warnings.catch_warnings():
-        # SciPy warns where the runs of one side are equal, which is no fault of the interval
-        warnings.filterwarnings("ignore", "Precision loss", RuntimeWarning)
-        low, high = stats.ttest_ind(ours, theirs, equal_var=False).confidence_interval(0.95)
-    return Estimate(value, (float(low), float(high)), runs)
+    groups = [runs for pair in pairs for runs in pair]
+    value, fewest = float(np.mean([ours.mean() - theirs.mean() for ours, theirs in pairs])), min(map(len, groups))
+    if fewest < 2:
+        return Estimate(value, None, fewest)
+    variances = np.array([runs.var(ddof=1) / len(runs) for runs in groups]) / len(pairs) ** 2
+    total = float(variances.sum())
+    if total == 0:
+        # Without any variance, the degrees of freedom are no number
+        return Estimate(value, (value, value), fewest)
+    freedom = total**2 / np.sum(variances**2 / [len(runs) - 1 for runs in groups])
+    half = float(stats.t.ppf(0.975, freedom)) * math.sqrt(total)
+    return Estimate(value, (value - half, value + half), fewest)
 
 
 def number_format(scores: pd.Series) -> str:
@@ -225,7 +227,7 @@ def probability_of_improvement(ours: np.ndarray, theirs: np.ndarray) -> np.ndarr
     return wins / (ours.shape[1] * theirs.shape[1])
 
 
-def difference(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+def interquartile_mean_difference(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     """
     Compare interquartile means.
 

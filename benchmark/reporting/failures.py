@@ -92,7 +92,7 @@ def _fails(table: pd.DataFrame, axis: str, is_bad: pd.Series, repetitions: int) 
     halved = sum(np.sum(poor < 0.5 * np.mean(good)) for good, poor in zip(pooled[::2], pooled[1::2], strict=True))
     names = [" or ".join(dict.fromkeys(values)) for values in (bad_values, good_values)]
     text = (
-        f"mean {means[0]:.2f} with {names[0]}, {means[1]:.2f} with {names[1]}: {found.in_words()} lost; "
+        f"mean {means[0]:.3f} with {names[0]}, {means[1]:.3f} with {names[1]}: {found.in_words('.3f')} lost; "
         f"{halved} of {sum(map(len, pooled[1::2]))} runs below half of the latter"
     )
     return [Part(text, judge(found, more_than=FAILURE))]

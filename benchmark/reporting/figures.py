@@ -110,7 +110,7 @@ def page_of(
     found = [
         overview(studies, repetitions),
         light_section(in_earnest),
-        experiments_section(in_earnest, repetitions),
+        experiments_section(in_earnest),
     ]
     pooled = [pooled_section(picture, f"{command} {FIGURES_ONLY}") for picture in together]
     results = []

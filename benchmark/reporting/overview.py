@@ -102,8 +102,9 @@ def finding(study: Study, table: pd.DataFrame, task: str, repetitions: int = REP
         if place > 0:
             text += f", {levels[place].reward.in_words(form)}"
         sentences.append(text + ("" if study.axes else _differences(table, task, ours, methods)) + ".")
-    if runs.groupby("method").size().max() < FEWEST_RUNS:
-        sentences.append("**Too few runs: nothing is concluded.**")
+    few = [method for method in methods if (runs["method"] == method).sum() < FEWEST_RUNS]
+    if few:
+        sentences.append(f"**Too few runs of {', '.join(few)}: nothing is concluded on them.**")
     return " ".join(sentences)
 
 

@@ -227,7 +227,7 @@ def comparison_tables(table: pd.DataFrame, study: Study, repetitions: int = REPE
     if table.groupby(["task", "method"]).size().max() < FEWEST_RUNS:
         return [f"Methods are compared from {FEWEST_RUNS} runs on, which none of them has yet."]
     parts = []
-    differences = "" if study.axes else differences_table(table, study.methods, repetitions)
+    differences = "" if study.axes else differences_table(table, study.methods)
     if differences:
         parts += ["**Differences between methods**", differences]
     improvement = improvement_table(table, study.methods, repetitions)
