@@ -174,7 +174,7 @@ def read_all(folder: Path) -> list[dict[str, Any]]:
     :return: the records, by file
     :raises ValueError: if one is damaged; it names the file and the remedy
     """
-    return [read_record(path) for path in sorted(folder.glob("*.json"))]
+    return [read_record(path) for path in sorted(folder.glob("[!.]*.json"))]
 
 
 def write_page(args: argparse.Namespace) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from benchmark.common.arguments import add_epilog, count, output_folder
 from benchmark.reporting.estimates import REPETITIONS
-from benchmark.reporting.figures import FIGURES, FIGURES_ONLY, FOLDER, figures, study_folders
+from benchmark.reporting.figures import FIGURES, FIGURES_ONLY, FOLDER, PAGE, figures, study_folders
 from benchmark.reporting.scores import read_study
 from benchmark.reporting.summary import summary
 from sb3_cgp.common.files import write_atomically
@@ -55,8 +55,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         "repository's own results.",
     )
     args = parser.parse_args(argv)
-    # A shell's * names the folder of the figures, too
-    named = [study for study in args.studies if Path(study) != args.folder / FIGURES]
+    # A shell's * names the folder of the figures and the page, too
+    named = [study for study in args.studies if Path(study) not in (args.folder / FIGURES, args.folder / PAGE)]
     try:
         folders = [find(study, args.storage, args.folder) for study in named] or study_folders(args.folder)
         if not folders:
@@ -91,12 +91,12 @@ def find(study: str, storage: str | None, out: Path) -> Path:
         raise FileNotFoundError(f"{study} is no folder; to take a study of that name from a storage, name it with --storage")
     # Optuna takes a second to import, and only studies of a storage need it
     from benchmark.sweeps.exports import export_study
-    from benchmark.sweeps.storages import STORAGE_ERRORS, reason_of
+    from benchmark.sweeps.storages import STORAGE_ERRORS, reason_of, without_password
 
     try:
         return export_study(study, storage, out)
     except KeyError as error:
-        raise FileNotFoundError(f"The storage {storage} holds no study {study}") from error
+        raise FileNotFoundError(f"The storage {without_password(storage)} holds no sweep {study}") from error
     except STORAGE_ERRORS as error:
         raise ValueError(f"the storage does not answer: {reason_of(error)}") from error
 

@@ -17,9 +17,8 @@ from rl_zoo3 import ALGOS, get_latest_run_id
 
 from benchmark.common.arguments import add_epilog, count
 from benchmark.common.environments import import_packages, split_env_id
-from benchmark.common.zoo import read_entry, shortened_warm_up, warm_up_in_words
+from benchmark.common.zoo import EVALUATIONS_PER_RUN, read_entry, shortened_warm_up, warm_up_in_words
 
-EVALUATIONS_PER_RUN = 20
 LONGEST_INTERVAL = 10_000
 
 

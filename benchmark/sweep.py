@@ -17,6 +17,7 @@ if __name__ == "__main__":
     refuse_unknown_sweep(sys.argv[1:])
 
 from benchmark.common.arguments import add_epilog, add_hyperparameters, count, output_folder
+from benchmark.common.zoo import warm_up_in_words
 from benchmark.reporting.figures import FOLDER, figures, study_folders
 from benchmark.sweeps.checks import check_values
 from benchmark.sweeps.execution import execute
@@ -123,6 +124,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         studies = [study_name(sweep.name, args.study, args.task and sweep.file.tasks) for sweep in sweeps]
         storage = open_storage(args.storage)
         for sweep in sweeps:
+            if warm_up := sweep.shortened_warm_up():
+                print(warm_up_in_words(sweep.file.steps, **warm_up, remedy="--set learning_starts=..."), file=sys.stderr)
             print(f"Checking the hyperparameters of {sweep.name}", file=sys.stderr, flush=True)
             check_values(sweep)
         folders = [execute(sweep, storage, study, args, argv) for sweep, study in zip(sweeps, studies, strict=True)]
@@ -131,6 +134,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.exit(f"Error: {error}")
     except STORAGE_ERRORS as error:
         sys.exit(f"Error: the storage does not answer: {reason_of(error)}. When it does, the same command continues.")
+    except OSError as error:
+        sys.exit(f"Error: {error}")
     except KeyboardInterrupt:
         sys.exit(128 + signal.SIGINT)
 

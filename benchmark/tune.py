@@ -19,7 +19,7 @@ from benchmark.common.arguments import add_epilog, add_hyperparameters, count
 from benchmark.common.environments import import_packages, registered_environment, split_env_id
 from benchmark.common.zoo import shortened_warm_up, warm_up_in_words
 from benchmark.sweeps.checks import check_tuning
-from benchmark.sweeps.entries import base_entry, write_entry
+from benchmark.sweeps.entries import base_entry, check_file, write_entry
 from benchmark.sweeps.experiments import study_name
 from benchmark.sweeps.processes import add_workers, check_grace, share_of_cores
 from benchmark.sweeps.runs import checkpoint_interval
@@ -133,6 +133,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         check_grace(args.beat, args.grace)
         import_packages(args.gym_packages)
         tuning = tuning_of(args)
+        if args.write is not None:
+            # Before the tuning, whose result would be lost
+            check_file(args.write, tuning.task)
         study = study_name(f"tune-{args.algo}", args.study, [tuning.task])
         storage = open_storage(args.storage) if args.parent is None else patiently(open_storage, args.storage)
         if args.parent is None:
@@ -154,6 +157,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.exit(f"Error: {error}")
     except STORAGE_ERRORS as error:
         sys.exit(f"Error: the storage does not answer: {reason_of(error)}. When it does, the same command continues.")
+    except OSError as error:
+        sys.exit(f"Error: {error}")
     except KeyboardInterrupt:
         sys.exit(128 + signal.SIGINT)
 

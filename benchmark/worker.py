@@ -80,6 +80,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.exit(f"Error: {error}")
     except STORAGE_ERRORS as error:
         sys.exit(f"Error: the storage does not answer: {reason_of(error)}. When it does, the same command continues.")
+    except OSError as error:
+        sys.exit(f"Error: {error}")
     size = population_size(args.population, args.device)
     execute_runs(ledger, args.logs, f"{socket.gethostname()}:{os.getpid()}", args.beat, args.parent, args.device, size)
 

@@ -1,6 +1,7 @@
 """The files of sweeps: what they say, what follows from them, and what is refused."""
 
 import itertools
+import os
 import re
 import subprocess
 import sys
@@ -10,8 +11,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from benchmark.common.zoo import read_entry
 from benchmark.sweeps.experiments import included_sweeps, load_sweep, sweeps_folder
-from benchmark.sweeps.processes import start_workers
+from benchmark.sweeps.processes import share_of_cores, start_workers
 from benchmark.sweeps.validation import SweepError
 
 ROOT = Path(__file__).parent.parent
@@ -191,6 +193,26 @@ def test_short_runs_learn_with_the_numbers_of_random_steps_that_a_file_does_not_
     assert starts(steps=200_000) == {"CGP": None, "TD3": None, "PPO": None}
 
 
+def test_a_number_of_random_steps_that_is_meant_for_the_length_of_the_runs_is_kept(tmp_path, sweep_of):
+    """That which a file gives its own methods, and that of an entry for no more steps than the file's."""
+    sweep_of(methods={"A": {"algo": "td3", "hyperparams": {"learning_starts": 60}}}, steps=100)
+    kept, shortened = (load_sweep(str(tmp_path / "mine.yml"), dict(steps=steps)) for steps in (None, 99))
+    assert {run.hyperparams["learning_starts"] for run in kept.runs()} == {60}
+    assert {run.hyperparams["learning_starts"] for run in shortened.runs()} == {9}
+    assert (kept.shortened_warm_up(), shortened.shortened_warm_up()) == ({}, {"learning_starts": 9})
+    fixed = load_sweep(str(tmp_path / "mine.yml"), dict(steps=99, hyperparams={"learning_starts": 50}))
+    assert fixed.shortened_warm_up() == {}
+
+    entry = read_entry("cgp", "Pendulum-v1")
+    assert entry["learning_starts"] > entry["n_timesteps"] // 10
+    for steps, expected in (
+        (int(entry["n_timesteps"]), None),
+        (int(entry["n_timesteps"]) - 10, entry["n_timesteps"] // 10 - 1),
+    ):
+        sweep = sweep_of(methods={"CGP": {"algo": "cgp", "tuned": True}}, steps=steps)
+        assert {run.hyperparams.get("learning_starts") for run in sweep.runs()} == {expected}
+
+
 def test_methods_of_ones_own(sweep_of):
     sweep = sweep_of(methods={"mine": {"algo": "ppo", "hyperparams": {"n_steps": 64}, "tuned": True}})
     assert {(run.method, run.algo, run.tuned) for run in sweep.runs()} == {("mine", "ppo", True)}
@@ -270,6 +292,12 @@ def test_a_misspelt_sweep_is_refused_before_anything_slow_is_imported(name):
     assert f"Error: {name}: no such sweep: must be one of e1, e2, e3, e4, e5, e6, e7, e8, e10, " in found.stderr
     assert "import time:" in found.stderr
     assert all(slow not in found.stderr for slow in ("torch", "stable_baselines3", "optuna", "matplotlib"))
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="a process may use all cores")
+def test_threads_are_the_share_of_the_cores_that_the_process_may_use(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(6)))
+    assert [share_of_cores(number) for number in (1, 4, 7)] == [6, 1, 1]
 
 
 def test_processes_that_start_are_announced_with_their_logs(tmp_path, capsys):

@@ -69,11 +69,12 @@ def test_all_studies_of_a_folder(folder: Path, tmp_path: Path) -> None:
     page = (tmp_path / "results.md").read_text()
     assert "## Pendulum-v1: The study axis, " in page
     assert "## Pendulum-v1: The study axes, " in page
-    # As the shell has them in the place of a star, the folder of the figures among them
+    # As the shell has them in the place of `*/` and `*`, the folder of the figures and the page among them
     folders = [f"{path}/" for path in sorted(tmp_path.iterdir()) if path.is_dir()]
     assert str(tmp_path / "figures/") in [path.rstrip("/") for path in folders]
-    main([*folders, *options])
-    assert (tmp_path / "results.md").read_text() == page
+    for named in (folders, [str(path) for path in sorted(tmp_path.iterdir())]):
+        main([*named, *options])
+        assert (tmp_path / "results.md").read_text() == page
     with pytest.raises(SystemExit, match="holds no study"):
         main(["--folder", str(tmp_path / "axis")])
 
@@ -89,8 +90,11 @@ def test_named_study_is_taken_from_its_storage(folder: Path, tmp_path: Path, mon
     options = ["--storage", "sqlite:///studies.db", "--folder", str(tmp_path), "--repetitions", "20"]
     main(["mine", *options])
     assert "The study mine" in (tmp_path / "results.md").read_text()
-    with pytest.raises(SystemExit, match=r"The storage sqlite:///studies\.db holds no study yours"):
+    with pytest.raises(SystemExit, match=r"The storage sqlite:///studies\.db holds no sweep yours"):
         main(["yours", *options])
+    monkeypatch.setattr(sys.modules["benchmark.sweeps.exports"], "export_study", lambda name, *_: {}[name])
+    with pytest.raises(SystemExit, match=r"The storage postgresql://me:\*\*\*@host/x holds no sweep yours"):
+        main(["yours", "--storage", "postgresql://me:secret@host/x", "--folder", str(tmp_path)])
 
 
 def test_a_storage_that_does_not_answer_is_an_error(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from studies import GRACE, assert_each_run_once, make_sweep, pretend_to_train
 from benchmark.sweeps import storages
 from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.heartbeats import PROGRESS
-from benchmark.sweeps.storages import open_storage, patiently, reason_of
+from benchmark.sweeps.storages import open_storage, patiently, reason_of, without_password
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.worker_loop import execute_runs
 
@@ -38,6 +38,46 @@ def test_patience_with_a_database_that_is_away(clock, error):
     assert patiently(call, "there") == "there"
     # Twice as long each time, up to five seconds
     assert clock.now == pytest.approx(0.1 + 0.2 + 0.4 + 0.8 + 1.6 + 3.2)
+
+
+def test_a_long_patience_is_announced_once(clock, capsys):
+    def of(patience, n_failures):
+        answers = iter([StorageInternalError("away")] * n_failures)
+
+        def call():
+            for error in answers:
+                raise error
+
+        patiently(call, patience=patience)
+        return capsys.readouterr().err
+
+    assert of(300.0, 4) == "The storage does not answer (away): trying for 300 s\n"
+    assert of(300.0, 0) == of(storages.TABLES_TIMEOUT, 1) == ""
+
+
+@pytest.mark.parametrize(
+    ("url", "shown"),
+    [
+        ("postgresql://me:secret@host/sweeps", "postgresql://me:***@host/sweeps"),
+        ("grpc://me:secret@host", "grpc://me:***@host"),
+        ("sqlite:///logs/studies.db", "sqlite:///logs/studies.db"),
+        ("postgresql//me:secret@host/sweeps", "***"),
+        ("postgresql://me:secret@host:port/sweeps", "***"),
+        ("studies.db", "studies.db"),
+    ],
+)
+def test_no_password_is_shown(url, shown):
+    assert without_password(url) == shown
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["nosuch://me:secret@host/x", "nosuch//me:secret@host/x", "grpc://me:secret@host", "mysql+nosuch://me:secret@host/x"],
+)
+def test_messages_on_storages_have_no_password(url):
+    with pytest.raises(ValueError, match=r"The value of `storage` is '.*\*\*\*") as error:
+        open_storage(url)
+    assert "secret" not in str(error.value)
 
 
 def test_patience_has_an_end(clock):

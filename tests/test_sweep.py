@@ -151,6 +151,7 @@ def test_mistakes_end_the_command_with_what_is_allowed(tmp_path):
         (["e3", "--storage", "grpc://localhost"], "port"),
         (["e3", "--storage", "sqlite://"], "in the memory of one process"),
         (["e3", "--study", "my/study"], "must be the name of a folder"),
+        (["e3", "--storage", f"sqlite:///{__file__}/x/studies.db"], "Not a directory"),
         (["e3", "--gym-packages", "no_such_package"], "no_such_package"),
     ]:
         with pytest.raises(SystemExit) as error:
@@ -283,6 +284,33 @@ def test_another_studys_incomplete_folder_ends_a_finished_sweep_with_its_name(tm
     (other / "runs.jsonl").touch()
     with pytest.raises(SystemExit, match=rf"^Error: {other} is no folder of a study: study.json is missing; give"):
         main(command)
+
+
+@pytest.mark.parametrize(("missing", "is_refused"), [("study.json", True), ("runs.jsonl", False)])
+def test_half_of_a_studys_folder_is_not_adopted(tmp_path, ledger, monkeypatch, missing, is_refused):
+    """The description is written before the runs, so that it may be alone."""
+    _, folder = finished(tmp_path, ledger, monkeypatch)
+    (folder / missing).unlink()
+    description = describe(of_command_line(*SMALL, "--results", str(tmp_path))[0], [], "cpu")
+    if not is_refused:
+        assert ended_runs(folder, description) == ([], [])
+        return
+    with pytest.raises(
+        SweepError, match=rf"{folder / missing}: is missing, so that the runs beside it cannot be adopted; give"
+    ):
+        ended_runs(folder, description)
+
+
+def test_runs_of_earlier_commands_are_told(tmp_path, ledger, monkeypatch, capsys):
+    started = []
+    monkeypatch.setattr("benchmark.sweeps.execution.start_workers", lambda *args: started.append(args) or [])
+    places = ["--results", str(tmp_path / "results"), "--storage", f"sqlite:///{tmp_path}/studies.db", "--study", "mine"]
+    for options, is_told in ([], False), (["--methods", "SAC"], True):
+        with pytest.raises(SystemExit, match="runs of mine are left"):
+            main([*SMALL, *places, *options])
+        told = "mine also has 2 runs of earlier commands to train, such as TD3,"
+        assert (told in capsys.readouterr().err) == is_told
+    assert len(started) == 2
 
 
 def test_a_study_says_all_that_it_was_ever_given(tmp_path, ledger):

@@ -31,6 +31,9 @@ REPOSITORY = Path(__file__).resolve().parent.parent
         (["--storage", "studies.db"], "must be a database's URL"),
         (["--storage", "sqlite://"], "in the memory of one process"),
         (["--study", "my/study"], "must be the name of a folder"),
+        (["--write", "."], "is a folder, and must be a YAML file"),
+        (["--write", "list.yml"], "list.yml is not changed: it must be a mapping of tasks to their entries"),
+        (["--storage", "sqlite:///text.yml/x/studies.db"], "Error: .*Not a directory"),
         (["--env", "no_such_package:Env-v0"], "no_such_package"),
         (["--gym-packages", "no_such_package"], "no_such_package"),
         (["--conf-file", "text.yml"], "target_noise_clip: '5e-1' of the tuned method .td3. is text in YAML"),
@@ -43,6 +46,8 @@ def test_mistakes_end_the_command(tmp_path, monkeypatch, argv, message):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("benchmark.sweeps.storages.TABLES_TIMEOUT", 0.0)
     Path("text.yml").write_text("default: {policy: MlpPolicy, n_timesteps: 100, target_noise_clip: 5e-1}")
+    Path("list.yml").write_text("- 1")
+    monkeypatch.setattr(tune, "tune", lambda *args: pytest.fail("it tunes"))
     Path("others.yml").write_text("Reacher-v5: {gamma: 0.9}")
     Path("objects.py").write_text("hyperparams = {'default': {'policy': object()}}")
     with pytest.raises(SystemExit, match=message):

@@ -12,6 +12,9 @@ from rl_zoo3.exp_manager import ExperimentManager
 
 from sb3_cgp.zoo.registration import register
 
+# Points of a learning curve
+EVALUATIONS_PER_RUN = 20
+
 
 def read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str, Any]:
     """

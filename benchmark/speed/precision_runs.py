@@ -74,7 +74,7 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
     :raises ValueError: if one is damaged; it names the file and the remedy
     """
     remedy = "Move it away, and give the same command again, which trains its run anew."
-    records = [read_json(path, ("env", "dtype", "seed"), remedy) for path in folder.glob("*_seed*.json")]
+    records = [read_json(path, ("env", "dtype", "seed"), remedy) for path in folder.glob("[!.]*_seed*.json")]
     return sorted(records, key=lambda record: (record["env"], record["dtype"], record["seed"]))
 
 

@@ -88,20 +88,41 @@ def write_entry(path: Path, task: str, entry: Hyperparams, comment: str) -> None
     """
     # A symbolic link stays one, and lines end as before
     path = path.resolve()
-    text = path.read_bytes().decode() if path.is_file() else ""
+    text, before, (start, end) = _read(path, task)
     ending = "\r\n" if "\r\n" in text else "\n"
-    try:
-        before = yaml.safe_load(text) or {}
-        start, end = _lines_of(task, text)
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path} is no YAML file: {error}") from error
     body = yaml.safe_dump(entry, sort_keys=True, allow_unicode=True)
     block = [f"{task}:", f"  # {comment}", *(f"  {line}" for line in body.splitlines())]
     lines = text.splitlines()
     after = ending.join([*lines[:start], *block, *lines[end:]]) + ending
-    if not isinstance(before, dict) or _loaded(after) != {**before, task: entry}:
+    if _loaded(after) != {**before, task: entry}:
         raise ValueError(f"{path} is not changed: its entry {task} cannot be replaced without a change of others'")
     write_atomically(path, after.encode())
+
+
+def check_file(path: Path, task: str) -> None:
+    """
+    Check that a file could take an entry.
+
+    :param path: the file, which may be missing
+    :param task: the environment
+    :raises ValueError: if it is a folder, or no YAML file of entries by task
+    """
+    _read(path.resolve(), task)
+
+
+def _read(path: Path, task: str) -> tuple[str, dict[str, Any], tuple[int, int]]:
+    """Return a file's text, its entries, and the lines of a task's entry, as :func:`_lines_of` does."""
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder, and must be a YAML file")
+    text = path.read_bytes().decode() if path.is_file() else ""
+    try:
+        entries = yaml.safe_load(text) or {}
+        lines = _lines_of(task, text)
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is no YAML file: {error}") from error
+    if not isinstance(entries, dict):
+        raise ValueError(f"{path} is not changed: it must be a mapping of tasks to their entries")
+    return text, entries, lines
 
 
 def _loaded(text: str) -> Any:

@@ -84,6 +84,13 @@ def execute(sweep: Sweep, storage: BaseStorage, study: str, args: argparse.Names
     description["commands"] = [*earlier, *description["commands"]]
     ledger.open(sweep, description, ended)
     check_no_run_is_lost(args.results / study, ledger)
+    others = set(ledger.left()) - {run.key for run in sweep.runs()}
+    if others:
+        print(
+            f"{study} also has {len(others)} runs of earlier commands to train, such as {min(others)}; another --study leaves "
+            "them out",
+            file=sys.stderr,
+        )
     tracker = ProgressTracker(sweep.file.steps)
     # A finished study needs no process that finds nothing to train
     n_workers = args.workers if ledger.left() else 0

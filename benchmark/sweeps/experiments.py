@@ -6,6 +6,7 @@ A file's keys are the fields of :class:`~benchmark.sweeps.sweep_files.SweepFile`
 
 import functools
 import itertools
+import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,7 +16,7 @@ from typing import Any
 from huggingface_sb3 import EnvironmentName
 
 from benchmark.common.sweep_names import METHODS_FILE, problem_of, sweep_names, sweep_path, sweeps_folder
-from benchmark.common.zoo import read_entry, shortened_warm_up
+from benchmark.common.zoo import EVALUATIONS_PER_RUN, read_entry, shortened_warm_up
 from benchmark.sweeps.hyperparameters import problems
 from benchmark.sweeps.runs import Run, checkpoint_interval
 from benchmark.sweeps.sweep_files import Hyperparams, Inclusion, Method, Packages, SweepFile
@@ -35,6 +36,7 @@ class Sweep:
     :param methods: the methods by name
     :param changes: the changes that have an effect, as text, without tasks, seeds and methods, which are those of the runs
     :param path: the file; None for a sweep without one
+    :param is_shortened: whether the runs are shorter than the file says
     """
 
     name: str
@@ -42,6 +44,7 @@ class Sweep:
     methods: dict[str, Method]
     changes: list[str] = field(default_factory=list)
     path: Path | None = None
+    is_shortened: bool = False
 
     @property
     def seeds(self) -> list[int]:
@@ -73,8 +76,7 @@ class Sweep:
         file = self.file
         hyperparams = self.methods[method].hyperparams
         algo, is_tuned = self.methods[method].algo, self.methods[method].tuned
-        entry = tuned_entry(algo, task) if is_tuned else {}
-        hyperparams = hyperparams | shortened_warm_up(algo, entry | hyperparams, file.steps) | file.hyperparams
+        hyperparams = hyperparams | self._warm_up(method, task) | file.hyperparams
         for axis, value in settings.items():
             hyperparams = hyperparams | file.axes[axis].hyperparams(axis, value, method)
         return Run(
@@ -91,6 +93,29 @@ class Sweep:
             file.checkpoint_interval or checkpoint_interval(file.steps),
             file.gym_packages,
         )
+
+    def _warm_up(self, method: str, task: str) -> dict[str, int]:
+        """Return the number of random steps at the start, where it replaces one that is meant for longer runs."""
+        algo, own = self.methods[method].algo, self.methods[method].hyperparams
+        entry = tuned_entry(algo, task) if self.methods[method].tuned else {}
+        if "learning_starts" in own:
+            # The file of named methods serves runs of all lengths
+            is_meant = isinstance(self.file.methods, dict) and not self.is_shortened
+        else:
+            is_meant = self.file.steps >= float(entry.get("n_timesteps", math.inf))
+        return {} if is_meant else shortened_warm_up(algo, entry | own, self.file.steps)
+
+    def shortened_warm_up(self) -> dict[str, int]:
+        """
+        Return the number of random steps at the start that is in place of a method's own, of the first run that has it.
+
+        :return: ``learning_starts``; nothing if every run has the number of its method, of its axis or of the command line
+        """
+        for run in self.runs():
+            warm_up = self._warm_up(run.method, run.task)
+            if warm_up and warm_up.items() <= run.hyperparams.items():
+                return warm_up
+        return {}
 
 
 @functools.cache
@@ -167,10 +192,13 @@ def load_sweep(name: str, overrides: dict[str, Any] | None = None, methods: Sequ
     packages = validated(Packages, {"gym_packages": overrides.pop("gym_packages", [])}, "the command line").gym_packages
     # First the file alone, so that the error names the place of a mistake
     file = validated(SweepFile, content, path)
+    own_steps = file.steps
     if packages:
         overrides["gym_packages"] = [*file.gym_packages, *packages]
     if "steps" in overrides:
-        overrides = overrides | {"evaluation_interval": overrides.get("evaluation_interval", max(overrides["steps"] // 20, 1))}
+        overrides = overrides | {
+            "evaluation_interval": overrides.get("evaluation_interval", max(overrides["steps"] // EVALUATIONS_PER_RUN, 1))
+        }
     changed = overrides.get("hyperparams", {})
     described = {key: value for key, value in overrides.items() if key not in RECOMPUTED}
     if "hyperparams" in overrides:
@@ -182,7 +210,9 @@ def load_sweep(name: str, overrides: dict[str, Any] | None = None, methods: Sequ
     for method in chosen:
         if method not in known:
             raise SweepError("the command line", "methods", f"{method!r} must be one of {', '.join(known)}")
-    sweep = Sweep(path.stem, file, {method: known[method] for method in chosen}, path=path)
+    sweep = Sweep(
+        path.stem, file, {method: known[method] for method in chosen}, path=path, is_shortened=file.steps < own_steps
+    )
     replaced = _replaced_hyperparams(sweep)
     for key, axes in replaced.items():
         place = "--set" if key in changed else path

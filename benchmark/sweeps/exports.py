@@ -9,7 +9,7 @@ from optuna.trial import TrialState
 
 from benchmark.common.files import write_json
 from benchmark.common.provenance import processors_of_commands
-from benchmark.common.records import RUNS, STUDY, Record, read_description, read_records, write_records
+from benchmark.common.records import REWRITE, RUNS, STUDY, Record, read_description, read_records, write_records
 from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.study_trials import owned
 from benchmark.sweeps.study_view import StudyView
@@ -82,8 +82,10 @@ def ended_runs(folder: Path, description: dict[str, Any]) -> tuple[list[Record],
     :raises SweepError: if they were trained with other settings; it names one
     :raises ValueError: if a file is damaged; it names the file and the remedy
     """
-    if not (folder / STUDY).is_file():
+    if not (folder / RUNS).is_file():
         return [], []
+    if not (folder / STUDY).is_file():
+        raise SweepError(folder / STUDY, "", f"is missing, so that the runs beside it cannot be adopted; {REWRITE}")
     was = read_description(folder, "configurations")
     for key in ("steps", "evaluation_interval", "evaluation_episodes", "configurations"):
         now = description[key]

@@ -38,7 +38,7 @@ from sb3_cgp.zoo.folders import state_folder
 # The folder of all populations, beside those of a study's configurations
 FOLDER = "populations"
 # The file in a population's folder with its runs
-RUNS = "runs.json"
+GROUP_RUNS = "runs.json"
 # Agents of a population on a GPU by default
 ON_GPU = 32
 # The beginning of the outcome of a run's trial
@@ -111,12 +111,12 @@ class Group:
         :param folder: the population's folder
         :return: the group
         """
-        return cls(folder, [Run(**fields) for fields in json.loads((folder / RUNS).read_bytes())])
+        return cls(folder, [Run(**fields) for fields in json.loads((folder / GROUP_RUNS).read_bytes())])
 
     def write(self) -> None:
         """Write the runs to the group's folder, for the process that goes on with it."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.folder / RUNS, _as_json(self.runs))
+        write_atomically(self.folder / GROUP_RUNS, _as_json(self.runs))
 
     @property
     def states(self) -> Path:
@@ -211,7 +211,7 @@ class Groups:
     def _begun(self, trial: FrozenTrial, names: dict[str, str | None]) -> Group | None:
         """Return the group in which a run goes on: that of its last process, if it has a saved state here."""
         name = names.get(trial.user_attrs[KEY])
-        if name is None or not (self._folder / FOLDER / name / RUNS).is_file():
+        if name is None or not (self._folder / FOLDER / name / GROUP_RUNS).is_file():
             return None
         group = Group.read(self._folder / FOLDER / name)
         return group if _run(trial) in group.runs and StateStore(group.states).steps() else None

@@ -8,9 +8,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmark.common.arguments import count, device_name
+from benchmark.common.arguments import count, device_name, output_folder
 from benchmark.sweeps.heartbeats import BEAT, GRACE
 from benchmark.sweeps.storages import DEFAULT_STORAGE
+from sb3_cgp.population.processes import available_cores
 
 # Seconds between two reads of a study of which nothing waits
 PAUSE = 2.0
@@ -36,7 +37,7 @@ def add_workers(parser: argparse.ArgumentParser, logs: str) -> None:
     parser.add_argument("--workers", type=count, default=1, help="processes on this machine (default: %(default)s)")
     parser.add_argument("--threads", type=count, help="PyTorch's threads in each (default: the cores' share)")
     parser.add_argument("--device", type=device_name, default="auto", help="device of the networks (default: %(default)s)")
-    parser.add_argument("--logs", type=Path, default=Path(logs), help="folder of the runs (default: %(default)s)")
+    parser.add_argument("--logs", type=output_folder, default=Path(logs), help="folder of the runs (default: %(default)s)")
     add_heartbeats(parser)
 
 
@@ -69,12 +70,12 @@ def check_grace(beat: float, grace: float) -> None:
 
 def share_of_cores(n_workers: int) -> int:
     """
-    Divide the machine's cores among processes.
+    Divide the cores that this process may use among processes.
 
     :param n_workers: number of processes
     :return: threads for each
     """
-    return max((os.cpu_count() or 1) // n_workers, 1)
+    return max(available_cores() // n_workers, 1)
 
 
 def start_workers(command: Sequence[str], n_workers: int, threads: int, folder: Path) -> list[subprocess.Popen[bytes]]:

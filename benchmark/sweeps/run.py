@@ -36,7 +36,7 @@ from sb3_cgp.zoo.registration import register
 from sb3_cgp.zoo.resumed_run import ResumedExperiment
 
 # The file in a run's folder with the run that its states belong to
-SETTINGS = "run.json"
+RUN_FILE = "run.json"
 # Errors that are no fault of the run: of the database, the disk, a missing package, too little memory, or a GPU, which no
 # training of the same process can use after such an error
 MACHINE_ERRORS = (
@@ -122,11 +122,11 @@ def has_state(run: Run, folder: Path) -> bool:
 
 
 def _is_of(run: Run, folder: Path) -> bool:
-    path = folder / SETTINGS
-    return path.is_file() and path.read_bytes() == _settings(run)
+    path = folder / RUN_FILE
+    return path.is_file() and path.read_bytes() == _run_as_json(run)
 
 
-def _settings(run: Run) -> bytes:
+def _run_as_json(run: Run) -> bytes:
     return json.dumps(asdict(run)).encode()
 
 
@@ -138,7 +138,7 @@ def begin(run: Run, folder: Path) -> None:
     :param folder: the run's folder
     :raises FileExistsError: if the folder holds a run on another environment
     """
-    path = folder / SETTINGS
+    path = folder / RUN_FILE
     if not _is_of(run, folder):
         other = json.loads(path.read_bytes()) if path.is_file() else {}
         if other.get("task", run.task) != run.task:
@@ -148,7 +148,7 @@ def begin(run: Run, folder: Path) -> None:
                 "or another folder by --logs"
             )
         forget_states(folder)
-        write_atomically(path, _settings(run))
+        write_atomically(path, _run_as_json(run))
 
 
 def _set_up(run: Run, folder: Path, device: str) -> tuple[ExperimentManager, BaseAlgorithm]:

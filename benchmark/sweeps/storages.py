@@ -1,5 +1,6 @@
 """Opening Optuna's storages for many processes at once, and repeating calls while a database does not answer."""
 
+import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -43,7 +44,7 @@ def open_storage(url: str, create: bool = True) -> BaseStorage:
     if parts.scheme == "grpc":
         if parts.hostname is None or parts.port is None:
             raise ValueError(
-                f"The value of `storage` is {url!r}, but must have a host and a port, as in grpc://localhost:13000"
+                f"The value of `storage` is {without_password(url)!r}, but must have a host and a port, as in grpc://localhost:13000"
             )
         return GrpcStorageProxy(host=parts.hostname, port=parts.port)
     database = _read_url(url)
@@ -53,13 +54,27 @@ def open_storage(url: str, create: bool = True) -> BaseStorage:
     path = Path(database.database or "")
     if not create and not path.exists() and "uri" not in database.query:
         raise ValueError(
-            f"The value of `storage` is {url!r}, but there is no file {path}: give the --storage of the command that has "
-            "begun the study, from the same folder"
+            f"The value of `storage` is {without_password(url)!r}, but there is no file {path}: give the --storage of the "
+            "command that has begun the study, from the same folder"
         )
     return get_storage(_open_sqlite(database))
 
 
+def without_password(url: str) -> str:
+    """
+    Return a storage's URL as messages name it.
+
+    :param url: the URL
+    :return: the URL with stars in place of a password; of a text that is no URL, and may hold one, only stars
+    """
+    try:
+        return make_url(url).render_as_string(hide_password=True)
+    except (ArgumentError, ValueError):
+        return "***" if "@" in url else url
+
+
 def _read_url(url: str) -> URL:
+    shown = without_password(url)
     try:
         database = make_url(url)
         # SQLAlchemy's default driver for PostgreSQL depends on its version
@@ -71,12 +86,16 @@ def _read_url(url: str) -> URL:
             create_engine(database)
     except ModuleNotFoundError as error:
         extra = f" It is in the extra `sweeps`: {how_to_install('sweeps')}" if error.name == "psycopg2" else ""
-        raise ValueError(f"The value of `storage` is {url!r}, and its driver {error.name} is not installed.{extra}") from error
-    except (ArgumentError, ImportError) as error:
-        raise ValueError(f"The value of `storage` is {url!r}, but must be a database's URL: {error}") from error
+        raise ValueError(
+            f"The value of `storage` is {shown!r}, and its driver {error.name} is not installed.{extra}"
+        ) from error
+    except (ArgumentError, ImportError, ValueError) as error:
+        # The reason may quote a text that is no URL
+        reason = "" if shown == "***" else f": {error}"
+        raise ValueError(f"The value of `storage` is {shown!r}, but must be a database's URL{reason}") from error
     if is_in_memory:
         raise ValueError(
-            f"The value of `storage` is {url!r}, a database in the memory of one process, but must be one that other "
+            f"The value of `storage` is {shown!r}, a database in the memory of one process, but must be one that other "
             f"processes reach, such as {DEFAULT_STORAGE}"
         )
     return database
@@ -166,12 +185,19 @@ def patiently(call: Callable[..., Result], *args: Any, patience: float = 300.0, 
     :param kwargs: its arguments
     :return: the result of the call
     """
-    start, pause = time.monotonic(), 0.1
+    start, pause, is_told = time.monotonic(), 0.1, False
     while True:
         try:
             return call(*args, **kwargs)
-        except STORAGE_ERRORS:
+        except STORAGE_ERRORS as error:
             if time.monotonic() - start + pause > patience:
                 raise
+            if not is_told and patience > TABLES_TIMEOUT:
+                print(
+                    f"The storage does not answer ({reason_of(error)}): trying for {patience:.0f} s",
+                    file=sys.stderr,
+                    flush=True,
+                )
+                is_told = True
             time.sleep(pause)
             pause = min(2 * pause, 5.0)

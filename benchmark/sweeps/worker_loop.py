@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import get_device
 
 from benchmark.common.provenance import machine, processor
 from benchmark.sweeps.claimed_runs import ClaimedRuns
-from benchmark.sweeps.groups import FOLDER, RUNS, Group, Groups
+from benchmark.sweeps.groups import FOLDER, GROUP_RUNS, Group, Groups
 from benchmark.sweeps.heartbeats import BEAT, HeartbeatThread, TrialLostError
 from benchmark.sweeps.population_run import train_group
 from benchmark.sweeps.processes import PAUSE
@@ -134,7 +134,7 @@ def forget_ended(ledger: Ledger, logs: Path) -> None:
     :param logs: the folder of all sweeps' runs
     """
     ended = [Run(**trial.user_attrs[RUN]) for trial in owned(ledger.trials()).values() if trial.state.is_finished()]
-    for path in (logs / ledger.name / FOLDER).glob(f"*/{RUNS}"):
+    for path in (logs / ledger.name / FOLDER).glob(f"*/{GROUP_RUNS}"):
         group = Group.read(path.parent)
         if all(run in ended for run in group.runs):
             _forget(group, [])

@@ -15,7 +15,7 @@ from sb3_cgp.common.files import write_atomically
 from sb3_cgp.resumption.store import NoStateLeftError
 
 # The file of the hyperparameters, in the folder of the environment's name
-SETTINGS = "*/config.yml"
+ZOO_CONFIG = "*/config.yml"
 
 Experiment = TypeVar("Experiment", bound=ExperimentManager)
 
@@ -27,7 +27,7 @@ def has_settings(folder: Path) -> bool:
     :param folder: the run's folder
     :return: whether the run can continue in the folder
     """
-    return any(folder.glob(SETTINGS))
+    return any(folder.glob(ZOO_CONFIG))
 
 
 def resumed_experiment(kind: Callable[..., Experiment], run: Run, folder: Path, device: str) -> Experiment:
@@ -42,9 +42,9 @@ def resumed_experiment(kind: Callable[..., Experiment], run: Run, folder: Path, 
     :raises NoStateLeftError: if the folder does not hold the hyperparameters that rl_zoo3 saved when the run began
     """
     if not has_settings(folder):
-        raise NoStateLeftError(f"{folder} has no {SETTINGS}, which rl_zoo3 saves when a run begins")
+        raise NoStateLeftError(f"{folder} has no {ZOO_CONFIG}, which rl_zoo3 saves when a run begins")
     # With the hyperparameters of the algorithm's YAML file
-    (saved,) = folder.glob(SETTINGS)
+    (saved,) = folder.glob(ZOO_CONFIG)
     return kind(folder, _arguments(run, folder, device), dict(yaml.load(saved.read_text(), Loader=yaml.UnsafeLoader)))
 
 

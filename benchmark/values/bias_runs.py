@@ -63,7 +63,7 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
     :raises ValueError: if one is damaged, or of an unknown method; it names the file and the remedy
     """
     records = []
-    for path in folder.glob("*_seed*.json"):
+    for path in folder.glob("[!.]*_seed*.json"):
         record = read_json(path, ("method", "seed", "settings", "points"), REMEDY)
         if record["method"] not in METHODS:
             raise ValueError(
