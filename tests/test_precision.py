@@ -7,8 +7,9 @@ import pytest
 import torch as th
 from tables import unpadded
 
-from benchmark import precision
+from benchmark import environments, precision
 from benchmark.speed import elites, precision_runs, precision_tables
+from benchmark.values import bias_runs
 from sb3_cgp import CEM
 
 COMMON = {"env": "Pendulum-v1", "steps": 10}
@@ -76,6 +77,12 @@ def test_runs_are_recorded_as_they_end_and_not_repeated(tmp_path, monkeypatch):
     precision.main(options)
     assert asked == [("float32", 5), ("bfloat16", 5), ("float32", 6), ("float32", 6), ("bfloat16", 6)]
     assert "| 5, 6 |" in unpadded((tmp_path / "precision.md").read_text())
+
+
+@pytest.mark.parametrize("read", [precision_runs.read_records, bias_runs.read_records, environments.read_all])
+def test_a_file_that_a_killed_process_left_is_no_record(tmp_path, read):
+    (tmp_path / ".partial-12-Pendulum-v1_float32_seed0.json").write_text("{")
+    assert read(tmp_path) == []
 
 
 def test_a_damaged_record_is_named_before_any_run(tmp_path, monkeypatch):
