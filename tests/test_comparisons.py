@@ -194,6 +194,10 @@ def test_tasks_in_studies_of_their_own_are_compared_together(tmp_path: Path) -> 
     assert found[0].split()[0] == expected[0].split()[0]
     assert found[1:] == expected[1:] == [HIGHER, "8 and 8"]
     assert experiments_section([first]) == experiments_section([alone]) == ""
+    # A study of which no row has a run is not named
+    few = study(tmp_path, [record("TD3", 0, 1.0, task="Ant-v5")], "few")
+    few.facts["experiment"] = "e1"
+    assert "E1, the studies first, second:" in experiments_section([first, few, second])
 
 
 def test_all_tasks_are_those_on_which_both_were_compared(tmp_path: Path) -> None:

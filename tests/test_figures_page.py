@@ -14,7 +14,7 @@ from tables import unpadded
 
 from benchmark.figures import main
 from benchmark.reporting import figures as command
-from benchmark.reporting.figures import figures, study_folders
+from benchmark.reporting.figures import figures, stability_together, study_folders
 from benchmark.reporting.overview import anchor, finding
 from benchmark.reporting.scores import curves, evaluation_grid, read_study, score_table
 from benchmark.reporting.sections import reward_tables
@@ -94,6 +94,18 @@ def test_page_repeats(folder: Path, tmp_path: Path) -> None:
         shutil.copytree(study, tmp_path / study.name)
     again = figures(study_folders(tmp_path), tmp_path, repetitions=100).read_text()
     assert again.replace(str(tmp_path), str(folder)) == (folder / "results.md").read_text()
+
+
+def test_the_figure_of_all_sweeps_names_the_methods_that_some_lack(tmp_path: Path) -> None:
+    methods = list(BASELINES)
+    all_of_them, fewer = (
+        read_study(write_study(tmp_path / name, runs(score, chosen, GRID[:2])))
+        for name, chosen in (("complete", methods), ("fewer", methods[:2]))
+    )
+    (picture,) = stability_together([all_of_them, fewer], 20)
+    assert picture.caption.endswith(f"as methods are missing: {', '.join(methods[2:])} in fewer.")
+    (picture,) = stability_together([all_of_them, all_of_them], 20)
+    assert "missing" not in picture.caption
 
 
 def test_page_names_sweeps_runs_and_failures(folder: Path) -> None:

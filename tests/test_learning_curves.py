@@ -85,7 +85,14 @@ def test_runs_without_a_time_are_left_out_with_a_note(tmp_path: Path) -> None:
     assert "Left out" not in minutes_caption(study(tmp_path, [timed("TD3", 0, 8.0)]), "Pendulum-v1")
 
 
-def command_on(cpu: str, capability: str = "AVX2", gpu: str | None = None) -> dict[str, object]:
+@pytest.mark.parametrize(("threads", "is_said"), [([1, 1], False), ([2, 1], True)])
+def test_commands_with_other_numbers_of_threads_are_told(tmp_path: Path, threads: list[int], is_said: bool) -> None:
+    commands = [{"machine": {**command_on("AMD")["machine"], "torch_threads": each}} for each in threads]
+    caption = minutes_caption(study(tmp_path, [timed("TD3", 0, 8.0)], commands=commands), "Pendulum-v1")
+    assert ("The commands used 1 or 2 threads" in caption) == is_said
+
+
+def command_on(cpu: str, capability: str = "AVX2", gpu: str | None = None) -> dict[str, dict[str, object]]:
     return {"machine": {"cpu": cpu, "cpu_capability": capability, "gpu": gpu}}
 
 
@@ -100,7 +107,9 @@ def command_on(cpu: str, capability: str = "AVX2", gpu: str | None = None) -> di
         ([command_on("AMD", gpu="H100"), command_on("Intel", gpu="H100")], None),
     ],
 )
-def test_runs_whose_processors_were_not_recorded(tmp_path: Path, commands: list[dict[str, object]], named: str | None) -> None:
+def test_runs_whose_processors_were_not_recorded(
+    tmp_path: Path, commands: list[dict[str, dict[str, object]]], named: str | None
+) -> None:
     chosen = study(tmp_path, [timed("TD3", 0, 8.0)], commands=commands)
     caption = minutes_caption(chosen, "Pendulum-v1")
     _, by_minutes = figure(chosen, "Pendulum-v1", 20)["layout"]["updatemenus"][0]["buttons"]

@@ -1,5 +1,6 @@
 """Comparisons between the methods of a study without axes: differences of means, and probabilities of improvement."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -140,9 +141,16 @@ def experiments_section(studies: Sequence[Study]) -> str:
         methods = list(dict.fromkeys(method for study in members for method in study.methods))
         rows = pooled_rows(score_table(members), methods) if len(members) > 1 else []
         if rows:
-            names = ", ".join(study.name for study in members)
+            names = ", ".join(study.name for study in members if _is_compared(study))
             parts += [f"{family}, the studies {names}:", markdown_table(HEADER, rows)]
     return "\n\n".join(["## Differences on all tasks of an experiment", *parts]) if parts else ""
+
+
+def _is_compared(study: Study) -> bool:
+    """Return whether a task of a study has enough runs of two methods."""
+    numbers = Counter((record.task, record.method) for record in study.records)
+    tasks = Counter(task for (task, _), number in numbers.items() if number >= FEWEST_RUNS)
+    return max(tasks.values(), default=0) > 1
 
 
 def _row(task: str, pair: tuple[str, str], found: Estimate, form: str, runs: pd.DataFrame) -> list[str]:

@@ -35,8 +35,9 @@ CURVES = (
 )
 LITERATURE = " Open markers are mean returns from the literature, on other versions of the environment (table below)."
 MINUTES = (
-    "The same on {} by minutes of processor time, of all threads, evaluations included. A run's evaluation is placed at the "
-    "run's time times the evaluation's step divided by the run's steps, and a method's curve at the median over its runs."
+    "The same on {} by minutes of processor time, of all threads, evaluations and repeated steps after an interruption "
+    "included. A run's evaluation is placed at the run's time times the evaluation's step divided by the run's steps, and a "
+    "method's curve at the median over its runs."
 )
 SENSITIVITY = "learning curves, every seed (thin) and the interquartile mean over seeds (bold), on one vertical scale."
 STABILITY = (
@@ -215,6 +216,9 @@ def minutes_caption(study: Study, task: str) -> str:
         is_one = len(times.processors) == 1
         consequence = f"; the times are those on {times.processors[0]}" if is_one else ", so their times differ"
         sentences.append(f"The runs were on different machines ({', '.join(times.all_processors)}){consequence}.")
+    threads = sorted({command["machine"].get("torch_threads", 1) for command in study.facts["commands"]})
+    if len(threads) > 1:
+        sentences.append(f"The commands used {' or '.join(map(str, threads))} threads, on which the times depend.")
     return " ".join(sentences)
 
 
@@ -251,5 +255,9 @@ def stability_together(studies: Sequence[Study], repetitions: int = REPETITIONS)
         return []
     methods = list(dict.fromkeys(method for study in largest for method in study.methods))
     caption = STABILITY.format(f"of all sweeps ({', '.join(study.name for study in largest)}) that name the method")
+    lacking = {study.name: [method for method in methods if method not in study.methods] for study in largest}
+    missing = [f"{', '.join(lacks)} in {name}" for name, lacks in lacking.items() if lacks]
+    if missing:
+        caption += f" The curves rest on different configurations, as methods are missing: {'; '.join(missing)}."
     title = "Stability of all sweeps together"
     return [Picture(f"{FIGURES}/stability.png", title, caption, stability(score_table(largest), methods, repetitions))]

@@ -32,8 +32,8 @@ Numbers that seem to contradict each other:
   number of random steps at the start and the networks differ. Each study's section lists its own.
 
 The intervals do not contain the variance of the mean over other episodes, so small differences may be due to these episodes.
-The figures and tables of a study use its own runs; the figure of all sweeps together{{claims}} the runs of all studies
-here. {SIDE_RUNS_RULE}{{papers}}
+The figures and tables of a study use its own runs, and the figure of all sweeps together those of the studies that its
+caption names{{claims}}. {SIDE_RUNS_RULE}{{papers}}
 
 Intervals are 95 % percentile bootstrap intervals by rliable; runs are drawn within each task and configuration. Few runs make
 them too narrow: on normally distributed rewards, the interval of an interquartile mean of 2, 3, 4, 5, 10 runs contains the
@@ -49,11 +49,11 @@ SHARES = (
 
 # What the page adds where it judges the paper's claims
 WITH_CLAIMS = {
-    "claims": " and the claims use",
+    "claims": "; the claims use those of all studies here but E10's",
     "papers": "\nThe time of inference is measured separately, by `python -m benchmark.runtime`. "
     "Figure numbers in headings are the paper's.",
 }
-WITHOUT_CLAIMS = {"claims": " uses", "papers": ""}
+WITHOUT_CLAIMS = {"claims": "", "papers": ""}
 CLAIMS = "## The paper's claims"
 NO_DATA_OF_THE_USER = "None of the paper's experiments is on this page, and its runs have no data on the paper's claims."
 OF_THE_USER = (
