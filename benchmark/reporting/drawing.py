@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib import colormaps
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from benchmark.common.canvas import BAND, SEED, count_steps, draw_line, legend, panels, png, styled
@@ -25,6 +26,7 @@ LINE_STYLES: list[Any] = ["-", "--", "-.", ":", (0, (4, 1, 1, 1, 1, 1)), (0, (8,
 MARKERS = "osD^vXP"
 # Methods differ where the highest and the lowest of their shares are this far apart
 DIFFERENCE = 0.15
+RUNS_THAT_REACH_IT = "runs that reach it, %"
 
 
 @styled
@@ -40,22 +42,34 @@ def stability(table: pd.DataFrame, methods: Sequence[str], repetitions: int = RE
     tasks = list(dict.fromkeys(table["task"]))
     figure, grid = panels(len(tasks), columns=min(len(tasks), 2), size=(5.0, 3.0) if len(tasks) == 1 else (3.7, 2.8))
     for task, panel in zip(tasks, grid, strict=True):
-        runs = table[table["task"] == task]
-        levels, shares = np.unique(runs["score"]), []
-        for method, look in styles(methods).items():
-            cells = cells_of(runs[runs["method"] == method], "score")
-            if not cells:
-                continue
-            share, band = bootstrap(lambda scores, levels=levels: share_reaching(scores, levels), [cells], repetitions)
-            shares.append(share)
-            draw_line(panel, levels, 100 * share, method, look, drawstyle="steps-pre")
-            if band is not None:
-                panel.fill_between(levels, 100 * band[0], 100 * band[1], step="pre", color=look["color"], **BAND)
-        panel.set(title=task, xlabel="final reward", ylim=(-3, 103), xlim=differing_range(levels, np.array(shares)))
+        draw_stability(panel, table[table["task"] == task], methods, repetitions)
+        panel.set_title(task)
     for panel in grid[::2]:
-        panel.set_ylabel("runs that reach it, %")
+        panel.set_ylabel(RUNS_THAT_REACH_IT)
     legend(figure, grid)
     return png(figure)
+
+
+def draw_stability(panel: Axes, runs: pd.DataFrame, methods: Sequence[str], repetitions: int) -> None:
+    """
+    Draw the share of a task's runs that reach at least a reward into a panel.
+
+    :param panel: the panel
+    :param runs: the scores of the task's runs
+    :param methods: the methods, in the legend's order
+    :param repetitions: number of bootstrap samples
+    """
+    levels, shares = np.unique(runs["score"]), []
+    for method, look in styles(methods).items():
+        cells = cells_of(runs[runs["method"] == method], "score")
+        if not cells:
+            continue
+        share, band = bootstrap(lambda scores: share_reaching(scores, levels), [cells], repetitions)
+        shares.append(share)
+        draw_line(panel, levels, 100 * share, method, look, drawstyle="steps-pre")
+        if band is not None:
+            panel.fill_between(levels, 100 * band[0], 100 * band[1], step="pre", color=look["color"], **BAND)
+    panel.set(xlabel="final reward", ylim=(-3, 103), xlim=differing_range(levels, np.array(shares)))
 
 
 def differing_range(levels: np.ndarray, shares: np.ndarray) -> tuple[float, float]:

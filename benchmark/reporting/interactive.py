@@ -11,6 +11,7 @@ from benchmark.reporting.estimates import REPETITIONS, bootstrap, interquartile_
 from benchmark.reporting.learning_curves import MOST, first_training_step, learnt_range, shown_methods, times_of
 from benchmark.reporting.literature import published
 from benchmark.reporting.scores import Study, curves, evaluation_grid, floors
+from benchmark.reporting.verdicts import SHOWN_FIRST
 
 Trace = dict[str, Any]
 
@@ -18,8 +19,6 @@ Trace = dict[str, Any]
 SYMBOLS = {"o": "circle", "s": "square", "D": "diamond", "v": "triangle-down", "^": "triangle-up", "P": "cross", "X": "x"}
 DASHES = {"-": "solid", "--": "dash", "-.": "dashdot", ":": "dot"}
 STEPS, MINUTES = "environment steps", "minutes of processor time"
-# Those that are shown at first, so that the figure can be read; the others wait in the legend
-FIRST = ("CGP-Online", "CGP-Light", "TD3", "SAC")
 
 
 def figure(study: Study, task: str, repetitions: int = REPETITIONS) -> dict[str, Any]:
@@ -36,7 +35,8 @@ def figure(study: Study, task: str, repetitions: int = REPETITIONS) -> dict[str,
     keys = {record.key for record in times.runs}
     data: list[Trace] = []
     methods = shown_methods(study, task)
-    first = [method for method in FIRST if method in methods] or methods[:MOST]
+    # The others wait in the legend, so that the figure can be read
+    first = [method for method in SHOWN_FIRST if method in methods] or methods[:MOST]
     for method in methods:
         runs = [record for record in study.records if (record.task, record.method) == (task, method)]
         visible = True if len(methods) <= MOST or method in first else "legendonly"

@@ -2,19 +2,16 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 
 from benchmark.common.canvas import BAND, draw_line, draw_seeds, legend, panels, png, styled
 from benchmark.common.style import styles
-from benchmark.reporting.drawing import differing_range
-from benchmark.reporting.estimates import REPETITIONS, bootstrap, cells_of, interquartile_mean, share_reaching
+from benchmark.reporting.drawing import RUNS_THAT_REACH_IT, draw_stability
+from benchmark.reporting.estimates import REPETITIONS, bootstrap, interquartile_mean
 from benchmark.reporting.learning_curves import show_learnt_range
 from benchmark.reporting.scores import Study, curves, evaluation_grid, floors, score_table
-
-# Those of them that a study ran are drawn
-METHODS = ("CGP-Online", "CGP-Light", "TD3", "SAC")
+from benchmark.reporting.verdicts import SHOWN_FIRST
 
 
 @styled
@@ -46,10 +43,10 @@ def methods_of(study: Study, task: str) -> Sequence[str]:
     :return: the methods
     :raises ValueError: if no run of any has been evaluated
     """
-    runs = [record for record in study.records if record.task == task and record.method in METHODS]
-    methods = [method for method in METHODS if any(run.method == method for run in runs)]
+    runs = [record for record in study.records if record.task == task and record.method in SHOWN_FIRST]
+    methods = [method for method in SHOWN_FIRST if any(run.method == method for run in runs)]
     if not any(run.returns for run in runs):
-        raise ValueError(f"{study.name} has no evaluation of {', '.join(METHODS)}")
+        raise ValueError(f"{study.name} has no evaluation of {', '.join(SHOWN_FIRST)}")
     return methods
 
 
@@ -62,8 +59,7 @@ def _draw_learning(panel: Axes, study: Study, repetitions: int) -> None:
         lines = curves(runs, floor, grid)
         middle, interval = bootstrap(interquartile_mean, [[lines]], repetitions)
         draw_seeds(panel, grid, lines, look["color"])
-        planned = study.planned_seeds(method)
-        draw_line(panel, grid, middle, method if len(runs) >= planned else f"{method}, {len(runs)} of {planned} seeds", look)
+        draw_line(panel, grid, middle, study.label(method, len(runs)), look)
         if interval is not None:
             panel.fill_between(grid, *interval, color=look["color"], **BAND)
         drawn.append(lines)
@@ -77,17 +73,8 @@ def _draw_stability(panel: Axes, study: Study, repetitions: int) -> None:
     task = next(iter(study.tasks), "")
     methods = methods_of(study, task)
     table = score_table([study])
-    runs = table[(table["task"] == task) & table["method"].isin(methods)]
-    levels, shares = np.unique(runs["score"]), []
-    for method, look in styles(methods).items():
-        cells = cells_of(runs[runs["method"] == method], "score")
-        share, band = bootstrap(lambda scores: share_reaching(scores, levels), [cells], repetitions)
-        shares.append(share)
-        draw_line(panel, levels, 100 * share, method, look, drawstyle="steps-pre")
-        if band is not None:
-            panel.fill_between(levels, 100 * band[0], 100 * band[1], step="pre", color=look["color"], **BAND)
-    panel.set(title=f"{task}, {_configurations(study)}", xlabel="final reward", ylabel="runs that reach it, %", ylim=(-3, 103))
-    panel.set_xlim(differing_range(levels, np.array(shares)))
+    draw_stability(panel, table[(table["task"] == task) & table["method"].isin(methods)], methods, repetitions)
+    panel.set(title=f"{task}, {_configurations(study)}", ylabel=RUNS_THAT_REACH_IT)
 
 
 def _configurations(study: Study) -> str:

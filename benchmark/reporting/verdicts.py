@@ -10,6 +10,8 @@ from benchmark.reporting.estimates import FEWEST_RUNS, Estimate
 OURS = "CGP-Online"
 # The same with the light setting of CEM, which starts from the actor
 LIGHT = "CGP-Light"
+# The methods that a figure with room for a few shows, those of them that a study ran
+SHOWN_FIRST = (OURS, LIGHT, "TD3", "SAC")
 SUPPORTED, CONTRADICTED = "supported", "contradicted"
 NOT_DECIDED, NO_DATA = "not decided by these data", "no data"
 
