@@ -95,6 +95,10 @@ def test_the_reason_of_a_proxy_that_is_away_is_that_of_the_connection():
     assert "Failed to connect to remote host" in reason_of(error.value)
 
 
+def test_the_reason_of_an_error_without_a_text_is_its_class():
+    assert reason_of(ConnectionError()) == "ConnectionError"
+
+
 def test_no_patience_with_other_errors(clock):
     def call():
         raise KeyError("no such study")

@@ -14,15 +14,12 @@ from stable_baselines3.common.utils import get_device
 from benchmark.common.provenance import conditions
 from benchmark.sweeps.experiments import Sweep
 from benchmark.sweeps.exports import check_no_run_is_lost, ended_runs, export_study, without_places
-from benchmark.sweeps.processes import start_workers, stop
+from benchmark.sweeps.processes import INTERVAL, start_workers, stop
 from benchmark.sweeps.progress import ProgressTracker, display
 from benchmark.sweeps.runs import overview
 from benchmark.sweeps.signals import end_if_asked
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.worker_loop import forget_ended
-
-# Seconds between two reads of the study
-INTERVAL = 2.0
 
 
 def describe(sweep: Sweep, argv: Sequence[str], device: str, threads: int = 1) -> dict[str, Any]:

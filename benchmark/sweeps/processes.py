@@ -13,6 +13,8 @@ from benchmark.sweeps.heartbeats import BEAT, GRACE
 from benchmark.sweeps.storages import DEFAULT_STORAGE
 from sb3_cgp.population.processes import available_cores
 
+# Seconds between two reads of a study by the command that has started its workers
+INTERVAL = 2.0
 # Seconds between two reads of a study of which nothing waits
 PAUSE = 2.0
 

@@ -166,11 +166,11 @@ def reason_of(error: BaseException) -> str:
     Return why a storage does not answer.
 
     :param error: one of ``STORAGE_ERRORS``
-    :return: the first line of the error that Optuna's error was raised from
+    :return: the first line of the error that Optuna's error was raised from, or its class if it has no text
     """
     cause = error.__cause__ or error
     text = cause.details() if isinstance(cause, grpc.Call) else str(cause)
-    return str(text).splitlines()[0]
+    return text.splitlines()[0] if text else type(cause).__name__
 
 
 def patiently(call: Callable[..., Result], *args: Any, patience: float = 300.0, **kwargs: Any) -> Result:

@@ -38,10 +38,12 @@ from benchmark.sweeps.study_trials import (
     COMMAND,
     ERROR,
     KEY,
+    LOST,
     OUTCOME,
     POPULATION,
     PROCESSORS,
     RUN,
+    STOPPED,
     SWEEP,
     WORKER,
     Claim,
@@ -192,7 +194,7 @@ class Ledger(TrialWriter):
         trials = self.trials()
         silent = self._silence.find(trials)
         for trial in silent:
-            self._end(self._id(trial), TrialState.FAIL, outcome="lost: its process fell silent")
+            self._end(self._id(trial), TrialState.FAIL, outcome=LOST)
         trials = self.trials() if silent else trials
         self.enqueue_missing((Run(**trial.user_attrs[RUN]) for trial in trials), trials)
 
@@ -227,7 +229,7 @@ class Ledger(TrialWriter):
             return claim
         return None
 
-    def release(self, claim: Claim, outcome: str = "given back: its process was stopped") -> None:
+    def release(self, claim: Claim, outcome: str = STOPPED) -> None:
         """
         Give back a run that is not finished, to be continued by any process.
 

@@ -16,6 +16,8 @@ from benchmark.sweeps.runs import Run
 SWEEP, COMMAND = "sweep", "command "
 # Attributes of a trial
 RUN, KEY, ERROR, WORKER, OUTCOME = "run", "key", "error", "worker", "outcome"
+# Outcomes of trials whose run or configuration is to be continued
+STOPPED, LOST = "given back: its process was stopped", "lost: its process fell silent"
 # A list: the processor on which this trial was trained; of an adopted run, all that trained it
 PROCESSORS = "processors"
 # Of a run that is trained in a population: the number of its agents, and the name of the group of runs

@@ -8,13 +8,10 @@ from collections.abc import Sequence
 
 from optuna.trial import FrozenTrial, TrialState
 
-from benchmark.sweeps.processes import PAUSE, start_workers, stop
+from benchmark.sweeps.processes import INTERVAL, PAUSE, start_workers, stop
 from benchmark.sweeps.signals import TERMINATED, end_if_asked
 from benchmark.sweeps.study_trials import ERROR
 from benchmark.sweeps.tuner import Tuner, best_of, has_ended
-
-# Seconds between two reads of the study
-INTERVAL = 2.0
 
 
 def execute_trials(tuner: Tuner, args: argparse.Namespace) -> None:

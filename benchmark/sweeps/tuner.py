@@ -23,13 +23,9 @@ from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, run_folder, trai
 from benchmark.sweeps.scoring import PRUNERS, SCORING
 from benchmark.sweeps.signals import undisturbed
 from benchmark.sweeps.storages import patiently
-from benchmark.sweeps.study_trials import ERROR, OUTCOME
+from benchmark.sweeps.study_trials import ERROR, LOST, OUTCOME, STOPPED
 from benchmark.sweeps.tuning import ORIGIN, SCORES, Tuning
 from benchmark.sweeps.validation import SweepError
-
-# The outcome of a trial whose configuration is to be continued
-STOPPED = "given back: its process was stopped"
-
 
 # The attribute of the study that holds its settings
 TUNING = "tuning"
@@ -86,7 +82,7 @@ class Tuner:
         If this process dies between the two steps of that, a configuration is lost, and another is sampled in its place.
         """
         for trial in self._silence.find(self.trials()):
-            self._give_back(trial.number, "lost: its process fell silent")
+            self._give_back(trial.number, LOST)
 
     def _give_back(self, number: int, outcome: str) -> None:
         trial_id = self._id(number)
