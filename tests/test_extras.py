@@ -56,7 +56,9 @@ print("resumed at", resumed.num_timesteps)
 @pytest.mark.parametrize("missing", ["rl_zoo3", "rl_zoo3.utils"])
 def test_registration_and_resumption_without_rl_zoo3_name_the_extra(missing, monkeypatch, tmp_path):
     for name in [name for name in sys.modules if name.partition(".")[0] == "rl_zoo3"]:
-        monkeypatch.delitem(sys.modules, name)
+        # A second import of this one would replace Gymnasium's TimeLimit by another class for all later tests
+        if name != "rl_zoo3.gym_patches":
+            monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
     remedy = rf"needs {missing}, which is not installed. It is in the extra `zoo`: {re.escape(how_to_install('zoo'))}"
     with pytest.raises(ImportError, match=f"Registering CGP in rl_zoo3 {remedy}"):
