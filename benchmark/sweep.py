@@ -6,7 +6,6 @@ same ``--storage``, trains the runs that are left. At the end it exports the run
 """
 
 import argparse
-import signal
 import sys
 from collections.abc import Sequence
 
@@ -20,12 +19,13 @@ from benchmark.common.arguments import add_epilog, add_hyperparameters, count, o
 from benchmark.common.zoo import warm_up_in_words
 from benchmark.reporting.figures import FOLDER, figures, study_folders
 from benchmark.sweeps.checks import check_values
+from benchmark.sweeps.endings import errors_in_words
 from benchmark.sweeps.execution import execute
 from benchmark.sweeps.experiments import Sweep, experiments_in_words, included_sweeps, load_sweep, study_name
 from benchmark.sweeps.groups import add_population
 from benchmark.sweeps.processes import add_workers, check_grace, share_of_cores
 from benchmark.sweeps.signals import handle_as_command
-from benchmark.sweeps.storages import STORAGE_ERRORS, open_storage, reason_of
+from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.validation import SweepError
 
 EXAMPLES = """\
@@ -115,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     argv = sys.argv[1:] if argv is None else argv
     args = parse(argv)
     handle_as_command()
-    try:
+    with errors_in_words(ValueError):
         check_grace(args.beat, args.grace)
         names = included_sweeps(args.name)
         sweeps = [load(name, args) for name in names]
@@ -130,14 +130,6 @@ def main(argv: Sequence[str] | None = None) -> None:
             check_values(sweep)
         folders = [execute(sweep, storage, study, args, argv) for sweep, study in zip(sweeps, studies, strict=True)]
         print(f"The page is {figures(sorted({*folders, *study_folders(args.results)}), args.results)}")
-    except ValueError as error:
-        sys.exit(f"Error: {error}")
-    except STORAGE_ERRORS as error:
-        sys.exit(f"Error: the storage does not answer: {reason_of(error)}. When it does, the same command continues.")
-    except OSError as error:
-        sys.exit(f"Error: {error}")
-    except KeyboardInterrupt:
-        sys.exit(128 + signal.SIGINT)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ The same command, given again after any interruption, or on other machines with 
 """
 
 import argparse
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,13 +18,14 @@ from benchmark.common.arguments import add_epilog, add_hyperparameters, count
 from benchmark.common.environments import import_packages, registered_environment, split_env_id
 from benchmark.common.zoo import shortened_warm_up, warm_up_in_words
 from benchmark.sweeps.checks import check_tuning
+from benchmark.sweeps.endings import errors_in_words
 from benchmark.sweeps.entries import base_entry, check_file, write_entry
 from benchmark.sweeps.experiments import study_name
 from benchmark.sweeps.processes import add_workers, check_grace, share_of_cores
 from benchmark.sweeps.runs import checkpoint_interval
 from benchmark.sweeps.scoring import PRUNERS, SCORING
 from benchmark.sweeps.signals import handle_as_command, handle_as_worker
-from benchmark.sweeps.storages import STORAGE_ERRORS, open_storage, patiently, reason_of
+from benchmark.sweeps.storages import open_storage, patiently
 from benchmark.sweeps.tune_execution import execute_trials, tune
 from benchmark.sweeps.tuner import Tuner
 from benchmark.sweeps.tuning import SCORES, Tuning
@@ -129,7 +129,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     else:
         handle_as_worker(args.parent)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    try:
+    with errors_in_words(ValueError, ImportError):
         check_grace(args.beat, args.grace)
         import_packages(args.gym_packages)
         tuning = tuning_of(args)
@@ -153,14 +153,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(summary, *(f"  {name}: {value!r}" for name, value in sorted(entry.items())), sep="\n")
         if args.write is not None:
             write_entry(args.write, tuning.task, entry, summary)
-    except (ImportError, ValueError) as error:
-        sys.exit(f"Error: {error}")
-    except STORAGE_ERRORS as error:
-        sys.exit(f"Error: the storage does not answer: {reason_of(error)}. When it does, the same command continues.")
-    except OSError as error:
-        sys.exit(f"Error: {error}")
-    except KeyboardInterrupt:
-        sys.exit(128 + signal.SIGINT)
 
 
 if __name__ == "__main__":

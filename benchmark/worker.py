@@ -15,10 +15,11 @@ import optuna
 import torch as th
 
 from benchmark.common.arguments import add_epilog, count, device_name
+from benchmark.sweeps.endings import errors_in_words
 from benchmark.sweeps.groups import add_population, population_size
 from benchmark.sweeps.processes import add_heartbeats, check_grace
 from benchmark.sweeps.signals import handle_as_worker
-from benchmark.sweeps.storages import STORAGE_ERRORS, open_storage, patiently, reason_of
+from benchmark.sweeps.storages import open_storage, patiently
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.worker_loop import execute_runs
 from sb3_cgp.common.rules import require
@@ -74,14 +75,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parse(sys.argv[1:] if argv is None else argv)
     handle_as_worker(args.parent)
     th.set_num_threads(args.threads)
-    try:
+    with errors_in_words(ValueError):
         ledger = open_ledger(args)
-    except ValueError as error:
-        sys.exit(f"Error: {error}")
-    except STORAGE_ERRORS as error:
-        sys.exit(f"Error: the storage does not answer: {reason_of(error)}. When it does, the same command continues.")
-    except OSError as error:
-        sys.exit(f"Error: {error}")
     size = population_size(args.population, args.device)
     execute_runs(ledger, args.logs, f"{socket.gethostname()}:{os.getpid()}", args.beat, args.parent, args.device, size)
 
