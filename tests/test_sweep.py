@@ -1,4 +1,4 @@
-"""The command that runs sweeps: its arguments, what it exports and adopts, and how far it says it is."""
+"""The command that runs sweeps: its arguments, and what it exports and adopts."""
 
 import json
 from dataclasses import replace
@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch as th
 import yaml
-from optuna.trial import TrialState, create_trial
+from optuna.trial import TrialState
 
 from benchmark import tune, worker
 from benchmark.common.arguments import hyperparameter
@@ -17,11 +17,9 @@ from benchmark.sweeps.checks import check_values
 from benchmark.sweeps.execution import describe
 from benchmark.sweeps.experiments import load_sweep, study_name
 from benchmark.sweeps.exports import ended_runs, export_study
-from benchmark.sweeps.heartbeats import PROGRESS
-from benchmark.sweeps.progress import ProgressTracker
 from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.studies import Ledger
-from benchmark.sweeps.study_trials import ERROR, KEY
+from benchmark.sweeps.study_trials import KEY
 from benchmark.sweeps.validation import SweepError
 
 SMALL = ["e8", "--task", "Pendulum-v1", "--steps", "400", "--seeds", "1", "--methods", "TD3"]
@@ -364,44 +362,6 @@ def test_records_come_back(tmp_path):
     ]
     write_records(tmp_path, records)
     assert sorted(read_records(tmp_path), key=str) == sorted(records, key=str)
-
-
-def trial_of(key, state, step=0, **attributes):
-    value = 0.0 if state is TrialState.COMPLETE else None
-    attributes = {KEY: key, PROGRESS: {"step": step}} | attributes
-    return create_trial(state=state, value=value, user_attrs=attributes)
-
-
-def test_progress_counts_runs_and_measures_the_speed():
-    tally = ProgressTracker(steps=100)
-    waiting, done = trial_of("c", TrialState.WAITING), trial_of("a", TrialState.COMPLETE, 100)
-    failed = trial_of("d", TrialState.FAIL, 30, **{ERROR: "NaN"})
-    lost = trial_of("b", TrialState.FAIL, 80)
-    first = tally.add([lost, trial_of("b", TrialState.RUNNING, 20), waiting, done, failed], now=0.0)
-    assert (first.runs, first.done, first.running, first.failed) == (4, 1, 1, 1)
-    assert first.share == pytest.approx((100 + 100 + 20) / 400)
-    assert first.speed is None
-    second = tally.add([trial_of("b", TrialState.RUNNING, 60), waiting, done, failed], now=10.0)
-    assert second.speed == pytest.approx(4.0)
-    assert second.seconds_left == pytest.approx((400 - 260) / 4)
-    assert "1 of 4 runs done, 1 running, 1 failed, 4 steps/s, 0:00:35 left" in str(second)
-
-
-def test_the_time_left_counts_the_time_in_which_no_environment_moves():
-    tally, waiting = ProgressTracker(steps=100), trial_of("b", TrialState.WAITING)
-    tally.add([trial_of("a", TrialState.RUNNING, 0), waiting], now=0.0)
-    tally.add([trial_of("a", TrialState.RUNNING, 100), waiting], now=50.0)
-    # Its policy is trained offline
-    standing = tally.add([trial_of("a", TrialState.RUNNING, 100), waiting], now=200.0)
-    assert standing.speed is None
-    assert standing.seconds_left == pytest.approx(200.0)
-
-
-def test_the_time_left_forgets_what_is_long_past():
-    tally, runs = ProgressTracker(steps=1000), [trial_of("b", TrialState.WAITING)]
-    steps_by = {0.0: 0, 4000.0: 10, 7600.0: 910}
-    standings = [tally.add([trial_of("a", TrialState.RUNNING, step), *runs], now) for now, step in steps_by.items()]
-    assert standings[-1].seconds_left == pytest.approx((2000 - 910) / (900 / 3600))
 
 
 def test_the_description_is_plain_data_and_names_each_configuration():
