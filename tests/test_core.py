@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
+from learning import median_return
 
 import sb3_cgp
 from sb3_cgp import CGP
@@ -61,9 +62,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 model = CGP(
-    "MlpPolicy", make_vec_env("Pendulum-v1", seed=0), learning_starts=1_000, gamma=0.98, tau=0.02, batch_size=64,
-    policy_kwargs=dict(net_arch=[64, 64]), seed=0, device="cpu",
-).learn(6_000)
+    "MlpPolicy", make_vec_env("Pendulum-v1", seed=0), learning_rate=lambda remaining: 2e-3 * remaining, batch_size=64,
+    gamma=0.98, tau=0.02, learning_starts=2_000, policy_kwargs=dict(net_arch=[64, 64]), seed={seed}, device="cpu",
+).learn(10_000)
 print(evaluate_policy(model, make_vec_env("Pendulum-v1", seed=1_000), n_eval_episodes=20)[0], flush=True)
 """
 VARIANTS = {"CGP": dict(), "QGP": dict(policy_loss="qgp", policy_delay=2), "CEM": dict(policy_loss=None)}
@@ -111,4 +112,4 @@ def test_the_core_is_read_in_a_sitting():
 @pytest.mark.slow
 def test_the_core_alone_swings_up_the_pendulum():
     # Random actions earn about -1200, the best known policies about -150
-    assert float(run_alone(LEARNING)) >= -200
+    assert median_return(lambda seed: float(run_alone(LEARNING.format(seed=seed))), least=-200) >= -200

@@ -3,11 +3,13 @@
 import functools
 import re
 import runpy
+import statistics
 
 import matplotlib.pyplot as plt
 import pytest
 import yaml
 from examples import ROOT, STEPS, shortened
+from learning import median_return
 from stable_baselines3.common.callbacks import EvalCallback
 
 FOLDER = ROOT / "docs" / "notebooks"
@@ -15,12 +17,13 @@ NOTEBOOKS = sorted(path.name for path in FOLDER.glob("*.md"))
 CELLS = re.compile(r"^```\{code-cell\}\n(.*?)^```$", flags=re.DOTALL | re.MULTILINE)
 
 
-def run(name, monkeypatch, folder):
-    """Run the cells of a notebook in a folder, and return the names that they define."""
+def run(name, monkeypatch, folder, seed=0):
+    """Run the cells of a notebook in a folder, with another seed than 0 if asked, and return the names that they define."""
     monkeypatch.chdir(folder)
     plt.switch_backend("agg")
     names = {"__name__": "__main__"}
-    for number, cell in enumerate(CELLS.findall((FOLDER / name).read_text())):
+    text = (FOLDER / name).read_text().replace("seed=0)", f"seed={seed})")
+    for number, cell in enumerate(CELLS.findall(text)):
         exec(compile(cell, f"{name}, cell {number}", "exec"), names)
     plt.close("all")
     return names
@@ -68,10 +71,17 @@ def printed_return(name, text):
 
 @pytest.mark.slow
 def test_the_quickstart_learns(monkeypatch, tmp_path, capsys):
-    run("quickstart.md", monkeypatch, tmp_path)
-    text = capsys.readouterr().out
-    assert -250 < printed_return("", text) < -100
-    assert printed_return("actor: ", text) == pytest.approx(printed_return("cem: ", text), abs=30)
+    losses = {}
+
+    def learnt_return(seed):
+        run("quickstart.md", monkeypatch, tmp_path, seed)
+        text = capsys.readouterr().out
+        losses[seed] = printed_return("cem: ", text) - printed_return("actor: ", text)
+        return printed_return("", text)
+
+    # Random actions earn about -1200, the best known policies about -150
+    assert -200 <= median_return(learnt_return, least=-200) < -100
+    assert statistics.median(losses.values()) < 20
 
 
 @pytest.mark.slow
