@@ -2,6 +2,9 @@
 
 import statistics
 
+# On Pendulum-v1: random actions earn about -1200, the best known policies about -150
+SWUNG_UP = -200
+
 
 def median_return(mean_return, least):
     """
