@@ -87,6 +87,12 @@ def test_from_the_lower_of_two_maxima_it_finds_the_higher_as_often_as_its_prior_
         expected = 1 - (1 - in_region) ** n_prior
         assert share == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / n_states) + 1e-9)
 
+        # Whoever found it in the first of three iterations, whose samples are the same, still has it after the last
+        th.manual_seed(0)
+        thrice = ActorCEM(3, n_samples, 6, actor_fraction=fraction, actor_std=0.05)
+        later = thrice.select(two_maxima, n_states, 1, proposals=th.full((n_states, 1, 1), -0.5)).actions
+        assert (later > 0)[actions > 0].all()
+
 
 def test_nan_ranks_last():
     proposals = th.tensor([[[0.2]], [[0.4]]])

@@ -57,24 +57,38 @@ def test_more_proposals_than_samples():
     assert seen.actions[0].shape == (3, 4, 1)
 
 
+# Whatever the score: it prefers the proposals, others, or none
+SCORES = {
+    "near": lambda actions, proposals: -(actions - proposals).abs().sum(dim=2),
+    "far": lambda actions, proposals: (actions - proposals).abs().sum(dim=2),
+    "small": lambda actions, proposals: -actions.abs().sum(dim=2),
+    "constant": lambda actions, proposals: th.zeros(actions.shape[:2]),
+}
+
+
+@pytest.mark.parametrize("n_proposals", [1, 3])
+@pytest.mark.parametrize("score", SCORES)
 @pytest.mark.parametrize(
     "selector",
-    [
-        ActorCEM(1, 16, 6, actor_fraction=1.0, actor_std=0.0),
-        ActorCEM(3, 16, 6, actor_fraction=1.0, actor_std=0.0),
-        # Its later iterations draw all samples anew, before tanh
-        MPPI(1, 16, 6, "best", start=ActorStart(1.0, 0.0)),
-    ],
+    [ActorCEM(1, 16, 6, actor_fraction=1.0, actor_std=0.0), MPPI(1, 16, 6, "best", start=ActorStart(1.0, 0.0))],
     ids=str,
 )
-def test_without_share_of_the_prior_and_without_std_the_actors_action_comes_back(selector):
+def test_without_share_of_the_prior_and_without_std_the_actors_action_comes_back(selector, score, n_proposals):
     proposals = th.rand(7, 1, 3) * 2 - 1
     proposals[0], proposals[1] = 1.0, -1.0
-    # All samples have the same value but for rounding, or saturation: the proposal itself is the best
-    nearest = Seen(lambda actions: -(actions - proposals).abs().sum(dim=2))
-    selection = selector.select(nearest, 7, 3, proposals=proposals)
+    seen = Seen(lambda actions: SCORES[score](actions, proposals))
+    selection = selector.select(seen, 7, 3, proposals=proposals.repeat(1, n_proposals, 1))
     assert th.equal(selection.actions, proposals[:, 0])
     assert th.allclose(selection.std, th.zeros(7, 3), atol=1e-6)
+
+
+@pytest.mark.parametrize("score", SCORES)
+def test_with_more_iterations_the_actors_action_comes_back_but_for_the_clipping_of_saturated_ones(score):
+    proposals = th.rand(7, 1, 3) * 2 - 1
+    proposals[0], proposals[1] = 1.0, -1.0
+    selector = ActorCEM(3, 16, 6, actor_fraction=1.0, actor_std=0.0)
+    actions = selector.select(Seen(lambda actions: SCORES[score](actions, proposals)), 7, 3, proposals=proposals).actions
+    assert th.allclose(actions, proposals[:, 0], atol=0.0101)
 
 
 def test_without_proposals_it_is_the_papers_cem():

@@ -90,15 +90,22 @@ class ActorStart:
         proposals = proposals[:, : samples.shape[1]]
         n_proposals = proposals.shape[1]
         n_around = self.n_around(samples.shape[1], n_proposals)
+        around = slice(n_proposals, n_proposals + n_around)
         centres = before_tanh(proposals)
         samples[:, :n_proposals] = centres
-        if n_proposals > 1:
-            # Each of them in turn; one alone is broadcast
-            centres = centres.repeat(1, -(-n_around // n_proposals), 1)[:, :n_around]
-        samples[:, n_proposals : n_proposals + n_around].mul_(self.std).add_(centres)
+        samples[:, around].mul_(self.std).add_(_in_turn(centres, n_around))
         actions = samples.tanh()
         actions[:, :n_proposals] = proposals
+        if self.std == 0:
+            # The proposals again, and not the clipped ones
+            actions[:, around] = _in_turn(proposals, n_around)
         return samples, actions
+
+
+def _in_turn(proposals: th.Tensor, n: int) -> th.Tensor:
+    """Return ``n`` proposals for each state, each in turn, (B, n, A). One alone, (B, 1, A), is left to be broadcast."""
+    n_proposals = proposals.shape[1]
+    return proposals if n_proposals == 1 else proposals.repeat(1, -(-n // n_proposals), 1)[:, :n]
 
 
 def takes_proposals(selector: Any) -> bool:
