@@ -232,11 +232,15 @@ def test_one_task_is_not_all_tasks(tmp_path: Path) -> None:
     assert differences_table(score_table([chosen]), ["TD3", "SAC"]) == ""
 
 
-def compared(folder: Path, light: dict[str, float], seeds: int = 4) -> str:
-    """Write a study in which the paper's setting scores 50 on each task, in a range from 0 to 100, and the light one so."""
+def compared(folder: Path, light: dict[str, float], seeds: int = 4, spread: float = 1.0) -> str:
+    """
+    Write a study in which the paper's setting scores 50 on each task, in a range from 0 to 100, and the light one so.
+
+    Scores grow by ``spread`` with the seed.
+    """
     tasks = list(light)
-    records = runs(lambda *run: 50.0 + run[2], ["CGP-Online"], seeds=range(seeds), tasks=tasks)
-    records += [record("CGP-Light", seed, light[task] + seed, task) for task in tasks for seed in range(seeds)]
+    records = runs(lambda *run: 50.0 + spread * run[2], ["CGP-Online"], seeds=range(seeds), tasks=tasks)
+    records += [record("CGP-Light", seed, light[task] + spread * seed, task) for task in tasks for seed in range(seeds)]
     records += [record("TD3", 0, 100.0, task, returns=[0.0]) for task in tasks]
     return unpadded(light_section([study(folder, records)]))
 
@@ -255,10 +259,39 @@ def test_losses_are_named_with_their_tasks(tmp_path: Path) -> None:
     assert "| higher | 0% | 4 |" in text
 
 
-def test_no_loss_and_nothing_known(tmp_path: Path) -> None:
-    assert "**Not decided: of 1 tasks, CGP-Light is higher on 0, lower on none, and not distinguishable on 1.**" in compared(
-        tmp_path / "equal", {"Hopper-v5": 50.0}
-    )
+@pytest.mark.parametrize(
+    ("light", "answer", "higher"),
+    [
+        # The interval reaches 4.47 to both sides: the largest losses in it are 4.47, 4.97 and 5.07 % of the range
+        ({"Hopper-v5": 50.0}, "No", 0),
+        ({"Hopper-v5": 49.5}, "No", 0),
+        ({"Hopper-v5": 49.4}, "Not decided", 0),
+        ({"Hopper-v5": 49.5, "Ant-v5": 70.0}, "No", 1),
+        ({"Hopper-v5": 49.4, "Ant-v5": 70.0}, "Not decided", 1),
+    ],
+)
+def test_there_is_no_loss_if_no_interval_has_one_that_counts(
+    light: dict[str, float], answer: str, higher: int, tmp_path: Path
+) -> None:
+    counted = f"CGP-Light is higher on {higher}, lower on none, and not distinguishable on 1."
+    assert f"**{answer}: of {len(light)} tasks, {counted}**" in compared(tmp_path, light, spread=2.0)
+
+
+def test_each_experiment_has_its_own_answer(tmp_path: Path) -> None:
+    studies = []
+    for name, light in [("e1", 50.0), ("e10-quick", 20.0)]:
+        records = [replace(record("TD3", 0, 100.0, returns=[0.0]), experiment=name)]
+        for method, value in [("CGP-Online", 50.0), ("CGP-Light", light)]:
+            records += [replace(record(method, seed, value + seed), experiment=name) for seed in range(4)]
+        studies.append(study(tmp_path, records, name))
+        studies[-1].facts["experiment"] = name
+    text = unpadded(light_section(studies))
+    assert "In E1: **No: of 1 tasks" in text
+    assert "In E10: **Yes, on Pendulum-v1 (e10-quick, 1,000 steps) by 30.00" in text
+    assert text.count("| Pendulum-v1 (e1, 1,000 steps) |") == text.count("| Pendulum-v1 (e10-quick, 1,000 steps) |") == 1
+
+
+def test_no_loss_is_known(tmp_path: Path) -> None:
     text = compared(tmp_path / "few", {"Hopper-v5": 10.0}, seeds=3)
     assert "**Not known yet: on no task have 4 seeds of both methods ended.**" in text
     assert "Too few seeds have ended on Hopper-v5" in text

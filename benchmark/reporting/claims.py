@@ -21,7 +21,7 @@ from benchmark.reporting.estimates import (
     interquartile_range,
 )
 from benchmark.reporting.failures import FAILURE, HIGH_LEARNING_RATE, few_steps_fail, has_high_rate, high_rate_fails
-from benchmark.reporting.verdicts import CONTRADICTED, NOT_DECIDED, OURS, SUPPORTED, Finding, Part, judge
+from benchmark.reporting.verdicts import CONTRADICTED, MARGIN, NOT_DECIDED, OURS, SUPPORTED, Finding, Part, judge
 
 FAMILY = ("CGP-Online", "CGP-Offline", "QGP-Online", "QGP-Offline")
 IMITATED = "CEM"
@@ -30,8 +30,6 @@ VARIANTS = ("CGP", "QGP")
 # Experiments of this project, on tasks that the paper's claims are not about
 NOT_THE_PAPERS = (10,)
 BASELINES = ("TD3", "SAC", "DDPG")
-# The difference that counts as none, as a share of the task's range
-MARGIN = 0.05
 # Of the actor's inference time, with more CEM iterations to that with fewer
 COST_MARGIN = 0.1
 

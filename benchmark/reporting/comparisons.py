@@ -18,7 +18,7 @@ from benchmark.reporting.estimates import (
     number_format,
     probability_of_improvement,
 )
-from benchmark.reporting.scores import Study, experiment_number, score_table
+from benchmark.reporting.scores import Study, by_family, score_table
 from benchmark.reporting.verdicts import LIGHT, OURS
 
 RANDOM = "Random"
@@ -130,14 +130,8 @@ def experiments_section(studies: Sequence[Study]) -> str:
     :param studies: the studies, without those of shorter trial runs
     :return: the section, in Markdown; empty if no experiment without axes has several studies with enough runs
     """
-    families: dict[str, list[Study]] = {}
-    for study in studies:
-        if not study.axes:
-            # The files of one of this project's experiments are named after it: e10-quick, e10-locomotion
-            number = experiment_number(study)
-            families.setdefault(study.facts["experiment"] if number is None else f"E{number}", []).append(study)
     parts = []
-    for family, members in families.items():
+    for family, members in by_family(study for study in studies if not study.axes).items():
         methods = list(dict.fromkeys(method for study in members for method in study.methods))
         rows = pooled_rows(score_table(members), methods) if len(members) > 1 else []
         if rows:

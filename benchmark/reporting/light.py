@@ -13,10 +13,13 @@ from benchmark.reporting.comparisons import (
     task_difference,
 )
 from benchmark.reporting.estimates import FEWEST_RUNS, Estimate, number_format
-from benchmark.reporting.scores import Study, score_table
-from benchmark.reporting.verdicts import LIGHT, OURS
+from benchmark.reporting.scores import Study, by_family, score_table
+from benchmark.reporting.verdicts import LIGHT, MARGIN, OURS
 
 PAIR = (LIGHT, OURS)
+RULE = f"""\
+*Yes* names the tasks on which the whole interval of the difference is below 0. *No* means that no task's interval contains a
+loss of more than {MARGIN:.0%} of the task's range. Everything else is *not decided*."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,11 @@ class Comparison:
         return difference_in_words(self.reward)
 
     @property
+    def shows_no_loss(self) -> bool:
+        """Whether the interval contains no loss that counts."""
+        return self.word != TOO_FEW and self.largest_loss is not None and self.largest_loss <= MARGIN
+
+    @property
     def largest_loss(self) -> float | None:
         """The largest loss within the interval, as a share of the task's range; None without an interval."""
         return None if self.share.interval is None else min(max(0.0, -self.share.interval[0]), 1.0)
@@ -50,7 +58,7 @@ class Comparison:
 
 def light_section(studies: Sequence[Study]) -> str:
     """
-    Answer whether the light setting loses anything, and where.
+    Answer whether the light setting loses anything, and where, for each experiment by itself.
 
     :param studies: the studies
     :return: the section, in Markdown; empty if no study without axes plans both methods
@@ -58,8 +66,17 @@ def light_section(studies: Sequence[Study]) -> str:
     chosen = [study for study in studies if not study.axes and set(PAIR) <= set(study.methods)]
     if not chosen:
         return ""
+    parts = [f"## Does {LIGHT} lose anything against {OURS}?", RULE]
+    for family, members in by_family(chosen).items():
+        compared, missing = _compare(members)
+        parts += [f"In {family}: {answer(compared, missing)}", *([_table(compared)] if compared else [])]
+    return "\n\n".join(parts)
+
+
+def _compare(studies: Sequence[Study]) -> tuple[list[Comparison], list[str]]:
+    """Return the comparisons of an experiment, and the tasks without runs of both methods that have not failed."""
     compared, missing = [], []
-    for study in chosen:
+    for study in studies:
         table = score_table([study])
         for task in dict.fromkeys([*study.facts["tasks"], *study.tasks]):
             place = f"{task} ({study.name}, {study.facts['steps']:,} steps)"
@@ -71,14 +88,18 @@ def light_section(studies: Sequence[Study]) -> str:
                 form = number_format(table[table["task"] == task]["score"])
                 light, ours = (int(runs[runs["method"] == method]["failed"].sum()) for method in PAIR)
                 compared.append(Comparison(place, reward, share, form, (light, ours)))
+    return compared, missing
+
+
+def _table(compared: Sequence[Comparison]) -> str:
+    """Tabulate the comparisons, in Markdown."""
+    loss = "largest loss in the interval, of the task's range"
+    header = ["task", f"{LIGHT} − {OURS} (95 % interval)", f"{LIGHT} is", loss, "seeds"]
     rows = [
         [each.place, each.reward.in_words(each.form), each.word, _percent(each.largest_loss), str(each.reward.runs)]
         for each in compared
     ]
-    loss = "largest loss in the interval, of the task's range"
-    header = ["task", f"{LIGHT} − {OURS} (95 % interval)", f"{LIGHT} is", loss, "seeds"]
-    tables = [markdown_table(header, rows)] if rows else []
-    return "\n\n".join([f"## Does {LIGHT} lose anything against {OURS}?", answer(compared, missing), *tables])
+    return markdown_table(header, rows)
 
 
 def answer(compared: Sequence[Comparison], missing: Sequence[str]) -> str:
@@ -104,7 +125,7 @@ def answer(compared: Sequence[Comparison], missing: Sequence[str]) -> str:
         sentences = [f"**Yes, on {'; '.join(losses)}.**"]
     elif decided:
         higher = sum(each.word == HIGHER for each in decided)
-        answer_word = "No" if higher == total else "Not decided"
+        answer_word = "No" if sum(each.shows_no_loss for each in decided) == total else "Not decided"
         counted = f"higher on {higher}, lower on none, and not distinguishable on {len(decided) - higher}"
         sentences = [f"**{answer_word}: of {total} tasks, {LIGHT} is {counted}.**"]
     else:

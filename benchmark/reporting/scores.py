@@ -114,6 +114,21 @@ def experiment_number(study: Study) -> int | None:
     return int(number[1]) if number else None
 
 
+def by_family(studies: Iterable[Study]) -> dict[str, list[Study]]:
+    """
+    Group studies by their experiment, whose tasks may be studies of their own.
+
+    :param studies: the studies
+    :return: studies by experiment. The files of one of this project's experiments are named after it: e10-quick and
+        e10-locomotion are E10.
+    """
+    families: dict[str, list[Study]] = {}
+    for study in studies:
+        number = experiment_number(study)
+        families.setdefault(study.facts["experiment"] if number is None else f"E{number}", []).append(study)
+    return families
+
+
 def read_study(folder: Path) -> Study:
     """
     Read a study.

@@ -14,6 +14,8 @@ LIGHT = "CGP-Light"
 SHOWN_FIRST = (OURS, LIGHT, "TD3", "SAC")
 SUPPORTED, CONTRADICTED = "supported", "contradicted"
 NOT_DECIDED, NO_DATA = "not decided by these data", "no data"
+# The difference that counts as none, as a share of the task's range
+MARGIN = 0.05
 
 
 @dataclass(frozen=True)
