@@ -7,7 +7,7 @@ from measuring_commands import CPU, run_command
 from tables import unpadded
 
 from benchmark.speed import cem_calls, products
-from benchmark.speed.products import Sizes
+from benchmark.speed.products import LIGHT, Sizes
 from sb3_cgp.core.policies import repeated_q_score
 
 
@@ -57,8 +57,8 @@ def test_kernels_leave_out_those_that_the_processor_lacks_for_a_data_type(monkey
 
 def test_sizes_are_varied_one_at_a_time():
     sizes = cem_calls.sizes_to_measure(["batch", "width"])
-    assert sizes[0] == Sizes()
-    assert len(set(sizes)) == len(sizes) == 1 + 4 + 4
+    assert sizes[:2] == [Sizes(), LIGHT]
+    assert len(set(sizes)) == len(sizes) == 2 + 4 + 4
     assert {(size.batch, size.width) for size in sizes} == {
         *((batch, 256) for batch in (1, 32, 128, 256, 512)),
         *((128, width) for width in (64, 128, 256, 512, 1024)),
@@ -67,8 +67,11 @@ def test_sizes_are_varied_one_at_a_time():
 
 def test_selector_writes_what_follows_from_the_seconds(tmp_path):
     record = run_command("selector", tmp_path, "--rounds", "2", "--dtypes", "float32", "--vary")
-    (entry,) = record["calls"]
-    assert entry["sizes"] == {"batch": 128, "samples": 64, "iterations": 2, "action_dim": 6, "width": 256, "n_features": 17}
+    entry, light = record["calls"]
+    paper = dict(batch=128, samples=64, iterations=2, action_dim=6, width=256, n_features=17, start="prior")
+    assert entry["sizes"] == paper
+    assert light["sizes"] == paper | dict(samples=16, iterations=1, start="actor")
+    assert light["call_flops"] < entry["call_flops"] / 7
     call, plain = entry["call_seconds"]["all"], entry["plain_seconds"]["all"]
     assert len(call) == len(plain) == 2
     assert entry["ratio_to_plain"] == pytest.approx((call[0] / plain[0] + call[1] / plain[1]) / 2)
@@ -85,6 +88,28 @@ def test_selector_writes_what_follows_from_the_seconds(tmp_path):
     row = next(line for line in unpadded((tmp_path / "selector.md").read_text()).splitlines() if "128 × 64 × 2" in line)
     assert f"| {entry['ratio_to_plain']:.2f} |" in row
     assert f"| {entry['share_of_products']:.0%} |" in row
+
+
+def test_the_light_call_scores_sixteen_actions_from_the_actors_and_the_papers_twice_64_of_the_prior():
+    def calls(sizes):
+        seen = []
+
+        def make_score(network, features):
+            score = repeated_q_score(network, features)
+            return lambda actions: seen.append(actions.clone()) or score(actions)
+
+        run = cem_calls.cem_call(sizes, make_score, CPU)
+        run()
+        run()
+        return seen
+
+    first, second = calls(LIGHT)
+    assert first.shape == (128, 16, 6)
+    # The actor's actions, which are given, are the first samples of each call
+    assert th.equal(first[:, 0], second[:, 0])
+    papers = calls(Sizes())
+    assert [actions.shape for actions in papers] == [(128, 64, 6)] * 4
+    assert not th.equal(papers[0][:, 0], papers[2][:, 0])
 
 
 def test_selector_asks_for_the_data_type(tmp_path, monkeypatch):

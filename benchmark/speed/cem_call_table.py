@@ -9,6 +9,7 @@ from benchmark.speed.products import Sizes
 NOTES = """\
 Milliseconds of one CEM call on a Q-network with {n_features} features, two hidden layers and ReLU: medians of {rounds}
 rounds, in each of which every call of the table is timed once; one size is varied at a time around those of the first rows.
+"start" is where CEM starts; the actor's actions are given, and their time does not count.
 "plain" is the same call with the observation repeated for every sample, in float32, and "/ plain" the ratio to it. "of
 products" is the time of the critic's matrix products alone, without activations, over the time of the call. Both are medians
 of the ratios within each round.
@@ -28,6 +29,7 @@ def markdown(record: dict[str, Any]) -> str:
     """
     header = [
         "batch × samples × iterations",
+        "start",
         "actions",
         "width",
         "type",
@@ -44,6 +46,7 @@ def markdown(record: dict[str, Any]) -> str:
         rows.append(
             [
                 f"{sizes['batch']} × {sizes['samples']} × {sizes['iterations']}",
+                sizes["start"],
                 str(sizes["action_dim"]),
                 str(sizes["width"]),
                 entry["dtype"],

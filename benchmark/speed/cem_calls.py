@@ -10,14 +10,15 @@ import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
-from benchmark.speed.products import Sizes, bare_products, call_flops, outer_products, product_flops
+from benchmark.speed.products import LIGHT, Sizes, bare_products, call_flops, outer_products, product_flops
 from benchmark.speed.timing import interleaved, ratio, summary
 from sb3_cgp.core.cem import CEM, Score
 from sb3_cgp.core.policies import repeated_q_score
 from sb3_cgp.fast.scoring import q_score
+from sb3_cgp.selectors import ActorCEM
 
 DTYPES = {"float32": th.float32, "bfloat16": th.bfloat16}
-VARIATIONS: dict[str, tuple[int, ...]] = {
+VARIATIONS: dict[str, tuple[Any, ...]] = {
     "batch": (1, 32, 128, 256, 512),
     "samples": (16, 32, 64, 128, 256),
     "iterations": (1, 2, 4, 8),
@@ -31,10 +32,10 @@ def sizes_to_measure(varied: Sequence[str]) -> list[Sizes]:
     Return the sizes to measure: one is varied at a time around the default.
 
     :param varied: the sizes to vary
-    :return: the default, then the others, each once
+    :return: the default, that of CGP-Light, then the others, each once
     """
     variations = [replace(Sizes(), **{name: value}) for name in varied for value in VARIATIONS[name]]
-    return list(dict.fromkeys([Sizes(), *variations]))
+    return list(dict.fromkeys([Sizes(), LIGHT, *variations]))
 
 
 def cem_call(sizes: Sizes, make_score: Callable[[nn.Module, th.Tensor], Score], device: th.device) -> Callable[[], object]:
@@ -48,11 +49,13 @@ def cem_call(sizes: Sizes, make_score: Callable[[nn.Module, th.Tensor], Score], 
     """
     q_network = nn.Sequential(*create_mlp(sizes.n_features + sizes.action_dim, 1, [sizes.width] * 2)).to(device)
     features = th.randn(sizes.batch, sizes.n_features, device=device)
-    cem = CEM(iterations=sizes.iterations, samples=sizes.samples)
+    proposals = th.rand(sizes.batch, 1, sizes.action_dim, device=device) * 2 - 1
+    kind, given = (ActorCEM, {"proposals": proposals}) if sizes.start == "actor" else (CEM, {})
+    cem = kind(iterations=sizes.iterations, samples=sizes.samples)
 
     @th.no_grad()
     def run() -> None:
-        cem.select(make_score(q_network, features), sizes.batch, sizes.action_dim, device)
+        cem.select(make_score(q_network, features), sizes.batch, sizes.action_dim, device, **given)
 
     return run
 

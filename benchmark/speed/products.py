@@ -28,6 +28,7 @@ class Sizes:
     :param action_dim: action dimensions, A
     :param width: units of each of the two hidden layers, H
     :param n_features: features of a state, F
+    :param start: where CEM starts: "prior", or "actor", whose actions are given
     """
 
     batch: int = 128
@@ -36,11 +37,16 @@ class Sizes:
     action_dim: int = 6
     width: int = 256
     n_features: int = 17
+    start: str = "prior"
 
     @property
     def actions(self) -> int:
         """Actions scored in one iteration."""
         return self.batch * self.samples
+
+
+# The call of CGP-Light
+LIGHT = Sizes(samples=16, iterations=1, start="actor")
 
 
 def call_flops(sizes: Sizes) -> int:
