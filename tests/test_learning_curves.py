@@ -117,7 +117,7 @@ def test_runs_whose_processors_were_not_recorded(
     if named is None:
         assert "machines" not in caption
     else:
-        assert caption.endswith(f"on different machines ({named}), so their times differ.")
+        assert caption.endswith(f"on different machines ({named}), so their times cannot be compared.")
 
 
 def test_runs_whose_processor_was_not_recorded_have_that_of_all_commands(tmp_path: Path) -> None:
@@ -167,8 +167,26 @@ def test_times_are_compared_on_one_processor(
     elif len(compared) == 1:
         assert caption.endswith(f"on different machines (fast, slow); the times are those on {compared[0]}.")
     else:
-        assert caption.endswith("on different machines (fast, slow), so their times differ.")
+        assert caption.endswith("on different machines (fast, slow), so their times cannot be compared.")
     assert (len(times.processors) > 1) == (len(compared) > 1)
+
+
+def test_methods_without_a_run_on_the_processor_are_left_out(tmp_path: Path) -> None:
+    records = [replace(timed("CGP-Online", 0, 40.0), processors=FAST), replace(timed("CGP-Light", 0, 10.0), processors=FAST)]
+    records += [replace(timed("CGP-Light", 1, 30.0), processors=SLOW)]
+    records += [replace(timed("TD3", seed, 12.0), processors=SLOW) for seed in range(3)]
+    chosen = study(tmp_path, records, seeds=[0, 1, 2])
+    # Both processors trained two methods, the slow one more runs of them
+    times = times_of(chosen, "Pendulum-v1")
+    assert times.minutes_per_step == {"CGP-Light": pytest.approx(0.03), "TD3": pytest.approx(0.012)}
+    assert [run.method for run in times.runs] == ["CGP-Light"] * 2 + ["TD3"] * 3
+    end = "(fast, slow); the times are those on slow. Left out, as they have no run there: CGP-Online."
+    caption = minutes_caption(chosen, "Pendulum-v1")
+    assert caption.endswith(end)
+    assert "complete run" not in caption
+    with_sac = study(tmp_path / "four", [*records, replace(timed("SAC", 0, 5.0), processors=FAST)], seeds=[0, 1, 2])
+    paces = times_of(with_sac, "Pendulum-v1").minutes_per_step
+    assert paces == {"CGP-Online": pytest.approx(0.04), "CGP-Light": pytest.approx(0.01), "SAC": pytest.approx(0.005)}
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -36,8 +36,8 @@ CURVES = (
 LITERATURE = " Open markers are mean returns from the literature, on other versions of the environment (table below)."
 MINUTES = (
     "The same on {} by minutes of processor time, of all threads, evaluations and repeated steps after an interruption "
-    "included. A run's evaluation is placed at the run's time times the evaluation's step divided by the run's steps, and a "
-    "method's curve at the median over its runs."
+    "included. A run's evaluation is placed at the run's time times the evaluation's step divided by the run's steps, late by "
+    "up to the share of random steps, and a method's curve at the median over its runs."
 )
 SENSITIVITY = "learning curves, every seed (thin) and the interquartile mean over seeds (bold), on one vertical scale."
 STABILITY = (
@@ -204,7 +204,8 @@ def minutes_caption(study: Study, task: str) -> str:
     records = [record for record in study.records if record.task == task and record.method in shown]
     times = times_of(study, task)
     untimed = sum(record.processor_seconds is None for record in records)
-    incomplete = len(records) - untimed - len(times.runs)
+    elsewhere = sum(record.processor_seconds is not None and record.method in times.elsewhere for record in records)
+    incomplete = len(records) - untimed - elsewhere - len(times.runs)
     sentences = [MINUTES.format(task)]
     if any(record.task == task and record.population > 1 for record in study.records):
         sentences.append("The time of runs that were trained as one population is the process's, divided by their number.")
@@ -214,8 +215,10 @@ def minutes_caption(study: Study, task: str) -> str:
         sentences.append(f"Left out: {incomplete} run{'s' * (incomplete > 1)} of methods without a complete run with a time.")
     if len(times.all_processors) > 1:
         is_one = len(times.processors) == 1
-        consequence = f"; the times are those on {times.processors[0]}" if is_one else ", so their times differ"
+        consequence = f"; the times are those on {times.processors[0]}" if is_one else ", so their times cannot be compared"
         sentences.append(f"The runs were on different machines ({', '.join(times.all_processors)}){consequence}.")
+    if times.elsewhere:
+        sentences.append(f"Left out, as they have no run there: {', '.join(times.elsewhere)}.")
     threads = sorted({command["machine"].get("torch_threads", 1) for command in study.facts["commands"]})
     if len(threads) > 1:
         sentences.append(f"The commands used {' or '.join(map(str, threads))} threads, on which the times depend.")

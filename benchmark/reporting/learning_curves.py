@@ -74,12 +74,14 @@ class Times:
     :param minutes_per_step: by method
     :param processors: the processors on which these minutes were measured
     :param all_processors: those of all runs
+    :param elsewhere: the methods that are left out, as they were trained on other processors only
     """
 
     runs: list[Record]
     minutes_per_step: dict[str, float]
     processors: list[str]
     all_processors: list[str]
+    elsewhere: list[str]
 
 
 def times_of(study: Study, task: str) -> Times:
@@ -87,35 +89,40 @@ def times_of(study: Study, task: str) -> Times:
     Return a task's runs that curves by minutes show, and how long each method trains.
 
     The time of a run is shared evenly among its steps, so that an evaluation takes place at ``processor_seconds`` times
-    its step, divided by the run's steps. An evaluation of a method stands at the median of its runs' times: of those on the
-    processor that trained the most runs, among the processors that trained all methods, or of all runs if there is none. A
+    its step, divided by the run's steps. An evaluation of a method stands at the median of its runs' times, of those on the
+    processor that trained the most methods, and the most runs of them; of all runs, if no processor trained two methods. A
     failed run has the time of the method's other runs, as the step at which it failed is not recorded.
 
     :param study: the study
     :param task: the task
-    :return: the times of :func:`shown_methods`, without those of which no complete run has a time
+    :return: the times of :func:`shown_methods`, without those of which no complete run on that processor has a time
     """
     shown = shown_methods(study, task)
     records = [record for record in study.records if record.task == task and record.method in shown]
     measured = [record for record in records if record.processor_seconds is not None]
-    compared = _on_one_processor(study, [record for record in measured if not failed(record)])
+    complete = [record for record in measured if not failed(record)]
+    compared = _on_one_processor(study, complete)
     seconds: dict[str, list[float]] = {}
     for record in compared:
         seconds.setdefault(record.method, []).append((record.processor_seconds or 0.0) / record.steps)
     paces = {method: float(np.median(each)) / 60 for method, each in seconds.items()}
     kept = [record for record in measured if record.method in paces]
-    return Times(kept, paces, _all_processors(study, compared), _all_processors(study, kept))
+    elsewhere = [method for method in dict.fromkeys(record.method for record in complete) if method not in paces]
+    return Times(kept, paces, _all_processors(study, compared), _all_processors(study, measured), elsewhere)
 
 
 def _on_one_processor(study: Study, runs: Sequence[Record]) -> Sequence[Record]:
-    """Return the runs on the processor that trained the most of them, if one trained all methods; otherwise all runs."""
+    """Return the runs on the processor that trained the most methods, and the most runs; all runs if none trained two."""
     by_processor: dict[str, list[Record]] = {}
     for run in runs:
         if len(names := _processors(study, run)) == 1:
             by_processor.setdefault(names[0], []).append(run)
-    methods = {run.method for run in runs}
-    complete = [each for _, each in sorted(by_processor.items()) if {run.method for run in each} == methods]
-    return max(complete, key=len, default=runs)
+
+    def methods(some: Sequence[Record]) -> int:
+        return len({run.method for run in some})
+
+    most = max((by_processor[name] for name in sorted(by_processor)), key=lambda some: (methods(some), len(some)), default=[])
+    return most if methods(most) >= min(2, methods(runs)) else runs
 
 
 def _all_processors(study: Study, runs: Sequence[Record]) -> list[str]:
