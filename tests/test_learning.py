@@ -1,4 +1,4 @@
-"""Every variant learns: the paper's five on Pendulum, and CGP on a MuJoCo task."""
+"""Every variant and selector learns: the paper's five and three selectors on Pendulum, and CGP on a MuJoCo task."""
 
 import pytest
 from learning import SWUNG_UP, median_return
@@ -6,6 +6,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from benchmark.speed.training import train_by_zoo
+from sb3_cgp.selectors import MPPI, ActorOnly, ActorStart
 
 pytestmark = pytest.mark.slow
 
@@ -15,6 +16,10 @@ VARIANTS = {
     "QGP-Online": dict(policy_loss="qgp"),
     "QGP-Offline": dict(policy_loss="qgp", policy_training="offline"),
     "CEM": dict(policy_loss=None),
+    "CGP-Light": dict(cem_start="actor", cem_iterations=1, cem_samples=16),
+    "MPPI": dict(policy_kwargs=dict(net_arch=[64, 64], selector=MPPI(1, 16, start=ActorStart())), cem_dtype="float32"),
+    # TD3, which explores by the task's action noise
+    "ActorOnly": dict(policy_kwargs=dict(net_arch=[64, 64], selector=ActorOnly()), policy_loss="qgp", policy_delay=2),
 }
 
 

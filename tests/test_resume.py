@@ -22,6 +22,7 @@ from trainings import Interruption, Training, assert_same, fingerprint, interrup
 
 from sb3_cgp import CGP
 from sb3_cgp.resumption.store import StateStore
+from sb3_cgp.selectors import MPPI, ActorOnly, ActorStart
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
 
@@ -66,6 +67,8 @@ UNHURRIED = settings(
 )
 GAUSSIAN = NormalActionNoise(np.zeros(1), 0.1 * np.ones(1))
 NOISE = OrnsteinUhlenbeckActionNoise(np.zeros(1), 0.2 * np.ones(1))
+# The defaults, by which no warning says that another selector replaces CEM
+UNUSED = dict(cem_samples=64, cem_elites=6)
 CASES = {
     "CGP-Online": dict(),
     "QGP-Online": dict(policy_loss="qgp"),
@@ -74,6 +77,10 @@ CASES = {
     "QGP-Offline": dict(policy_loss="qgp", policy_training="offline"),
     "CGP-Light": dict(cem_start="actor", cem_iterations=1),
     "from the actor, offline": dict(cem_start="actor", policy_training="offline"),
+    "MPPI": dict(policy_kwargs=dict(net_arch=[8], selector=MPPI(2, 8, 3, start=ActorStart())), **UNUSED),
+    "the actor alone": dict(
+        policy_kwargs=dict(net_arch=[8], selector=ActorOnly()), policy_loss="qgp", action_noise=GAUSSIAN, **UNUSED
+    ),
     "averaged actor, delays": dict(inference="averaged_actor", policy_delay=3, target_update_interval=4),
     "n-step": dict(n_steps=3),
     "VecNormalize": dict(normalises=True),
