@@ -77,7 +77,8 @@ class CGP(
     :param cem_result: "best" acts by the best sample of the last iteration (the paper), "mean" by the elites' mean
     :param cem_start: "prior" draws CEM's first samples from N(0, 1), as the paper does. "actor" takes the actor's action,
         samples around it and samples of the prior, so that fewer suffice: ``cem_start="actor", cem_iterations=1,
-        cem_samples=16``, called CGP-Light, evaluates the critic an eighth as often. It needs an actor.
+        cem_samples=16``, called CGP-Light, evaluates the critic an eighth as often. It needs an actor: with
+        ``policy_training="offline"``, only the searches of that training start from it.
     :param cem_actor_fraction: with ``cem_start="actor"``, the share of ``cem_samples`` drawn around the actor's action.
         The rest, but for the actor's action itself, is drawn from the prior.
     :param cem_actor_std: standard deviation of the samples around the actor's action, before tanh
@@ -314,7 +315,7 @@ class CGP(
         :param custom_objects: Dictionary of objects to replace upon loading. A ``learning_rate`` among them replaces an
             actor's own learning rate too: rl_zoo3 replaces schedules that another version of Python may have pickled.
         :param print_system_info: Whether to print system info from the saved model and the current system info
-        :param force_reset: Force call to ``reset()`` before training to avoid unexpected behavior.
+        :param force_reset: Force call to ``reset()`` before training to avoid unexpected behaviour.
         :param kwargs: arguments to change in the model when loading, such as ``cem_iterations=4``
         :return: new model instance with loaded parameters
         :raises ValueError: if a changed argument is out of its range or contradicts another one

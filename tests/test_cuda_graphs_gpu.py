@@ -34,7 +34,7 @@ def test_a_selector_that_synchronizes_is_not_recorded_and_works():
             return selection
 
     model = CGP("MlpPolicy", "Pendulum-v1", device="cuda", policy_kwargs=dict(selector=Waiting(2, 8, 2)), **SMALL)
-    with pytest.warns(UserWarning, match="The host synchronizes with the GPU in"):
+    with pytest.warns(UserWarning, match="The host synchronises with the GPU in"):
         model.learn(60)
     assert model._n_updates == 30
     assert all(capture._recording is None for capture in model._recorded.values())

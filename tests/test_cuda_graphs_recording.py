@@ -109,7 +109,7 @@ def test_a_synchronization_is_noticed_and_other_warnings_are_passed_on(make_beli
         call(function, th.ones(1))
     other, waiting = (str(warning.message) for warning in warned)
     assert other == "something else"
-    assert re.match("The host synchronizes with the GPU in .*test_cuda_graphs_recording.py, line ", waiting)
+    assert re.match("The host synchronises with the GPU in .*test_cuda_graphs_recording.py, line ", waiting)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for _ in range(WARM_UP_CALLS):

@@ -50,7 +50,7 @@ def test_recorded_gradient_steps_ask_the_actors_that_are_trained(monkeypatch):
 @pytest.mark.parametrize("variant", ["CGP", "QGP", "CGP-Light", "MPPI from the actor", "TD3", "CEM", "n-step"])
 def test_on_a_gpu_gradient_steps_are_recorded_and_compute_the_same(variant):
     with warnings.catch_warnings():
-        # Such as one that the host synchronizes
+        # Such as one that the host synchronises
         warnings.simplefilter("error", UserWarning)
         recorded, ordinary = (
             make(AGENTS, device="cuda", cuda_graphs=cuda_graphs, **VARIANTS[variant]).learn(3 * 80)

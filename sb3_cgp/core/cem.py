@@ -53,9 +53,9 @@ class CEM:
     """
     Cross-Entropy Method with independent Gaussians (Algorithm 1), squashed by tanh into the action space.
 
-    :param iterations: number of iterations N of Algorithm 1, at least 1
-    :param samples: number of samples n per state and iteration, at least 1
-    :param elites: number of winners k to which the next Gaussian is fitted, from 1 to ``samples``
+    :param iterations: number of iterations of Algorithm 1, at least 1
+    :param samples: number of samples per state and iteration, at least 1
+    :param elites: number of best samples to which the next Gaussian is fitted, from 1 to ``samples``
     :param result: "best" returns the best of the last samples (the paper), "mean" the last elites' mean, which varies less
     :raises ValueError: if an argument is out of its range
     """

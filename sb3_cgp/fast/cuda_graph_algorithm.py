@@ -48,7 +48,7 @@ class CudaGraphAlgorithm(CGP):
     CGP whose gradient steps are recorded as CUDA graphs on a GPU, and replayed.
 
     The recorded function is the core's ``train`` itself, for one gradient step on a minibatch that was sampled before. Its
-    losses are read when the log is written, as the host would synchronize with the GPU at every step otherwise; a NaN or
+    losses are read when the log is written, as the host would synchronise with the GPU at every step otherwise; a NaN or
     infinite loss lets the optimizer skip the step, and is reported at that time. Without a GPU, and with ``Dict``
     observations or another optimizer than a fused Adam, steps are carried out as usual.
     """
@@ -221,7 +221,7 @@ class CudaGraphAlgorithm(CGP):
 
     def _report(self) -> None:
         """
-        Log the losses of recorded steps, for which the host synchronizes with the GPU.
+        Log the losses of recorded steps, for which the host synchronises with the GPU.
 
         :raises ValueError: if a loss was NaN or infinite
         """

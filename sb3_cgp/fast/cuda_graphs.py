@@ -83,7 +83,7 @@ class RecordedFunction:
     One function of tensors that is recorded on a GPU after a few calls, and replayed from then on.
 
     The function may change other tensors in place, such as parameters, which must keep their memory. A function that
-    synchronizes with the host cannot be recorded. The first replay is compared with a real call from the same state and
+    synchronises with the host cannot be recorded. The first replay is compared with a real call from the same state and
     random numbers. If a recording fails or differs, a warning says so, and every call is carried out as usual.
 
     :param list_state: returns the tensors that the function changes in place
@@ -204,7 +204,7 @@ def _warm_up(function: Function, inputs: Tensors, gpu: th.device | None) -> tupl
     """
     Call a function on the stream of the recording, as PyTorch's manual requires.
 
-    :return: its results, and whether the function synchronizes with the host
+    :return: its results, and whether the function synchronises with the host
     """
     if gpu is None:
         return function(*inputs), False
@@ -226,6 +226,6 @@ def _warm_up(function: Function, inputs: Tensors, gpu: th.device | None) -> tupl
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
     if len(synchronizing) > 0:
         place = f"{synchronizing[0].filename}, line {synchronizing[0].lineno}"
-        message = f"The host synchronizes with the GPU in {place}: this cannot be a CUDA graph, and is slower."
+        message = f"The host synchronises with the GPU in {place}: this cannot be a CUDA graph, and is slower."
         warnings.warn(message, stacklevel=2)
     return outputs, len(synchronizing) > 0

@@ -161,7 +161,7 @@ class DeviceReplayBuffer(ReplayBuffer):
         row["dones"] = done
         if self.handle_timeout_termination:
             row["timeouts"] = [info.get("TimeLimit.truncated", False) for info in infos]
-        # The call returns when pageable memory has been read, and does not synchronize with earlier work
+        # The call returns when pageable memory has been read, and does not synchronise with earlier work
         self._rows[self.pos].copy_(th.from_numpy(row.view(np.uint8).reshape(self.n_envs, -1)), non_blocking=True)
         self.pos += 1
         if self.pos == self.buffer_size:

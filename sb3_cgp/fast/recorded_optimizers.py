@@ -5,7 +5,7 @@ from typing import Any
 
 import torch as th
 
-# Gradient steps between two checks of the losses, each of which synchronizes with the GPU
+# Gradient steps between two checks of the losses, each of which synchronises with the GPU
 CHECK_INTERVAL = 100
 # Keys of the losses in the log, in the order in which a gradient step returns them
 LOSSES = ("critic_loss", "q_value", "actor_loss")

@@ -23,7 +23,7 @@ they are, bit for bit, and the other agents are not affected.
 Agent i begins with the networks and the environment that a CGP alone has with its seed. Given the same minibatches and random
 numbers, it computes what that CGP computes. In a population, all agents draw from one generator.
 
-The gradient step does not synchronize with the host, and changes its state in place: on a GPU it is a CUDA graph, and
+The gradient step does not synchronise with the host, and changes its state in place: on a GPU it is a CUDA graph, and
 so is the selection of actions in a rollout.
 """
 

@@ -1,7 +1,7 @@
 """
 A gradient step of all agents ("Train on replay buffer" of Algorithm 2), in the order of ``core/cgp.py``.
 
-Nothing here synchronizes with the host, and all state is changed in place, so that a CUDA graph can be made of it.
+Nothing here synchronises with the host, and all state is changed in place, so that a CUDA graph can be made of it.
 
 Shapes: N agents, C critics per agent, B transitions per agent, A action dimensions.
 """

@@ -18,11 +18,11 @@ class ActorCEM(CEM):
     CEM whose first samples include the actor's action, and samples around it.
 
     It needs fewer samples than the paper's CEM, as the actor knows nearly where the best action is. The best sample so far
-    is one of the next iteration's samples. Without proposals, all first samples are those of the prior.
+    is one of the next iteration's samples. Without proposals, it is the paper's CEM.
 
     :param iterations: number of iterations, at least 1
     :param samples: number of samples per state and iteration, at least 1
-    :param elites: number of winners to which the next Gaussian is fitted, from 1 to ``samples``
+    :param elites: number of best samples to which the next Gaussian is fitted, from 1 to ``samples``
     :param result: "best" returns the best sample, "mean" the mean of the last elites
     :param actor_fraction: share of the samples that is drawn around the actor's action, from 0 to 1
     :param actor_std: standard deviation of these samples, before tanh

@@ -25,7 +25,7 @@ class MPPI:
 
     :param iterations: number of iterations, at least 1
     :param samples: number of samples per state and iteration, at least 1
-    :param elites: number of winners, from 1 to ``samples``
+    :param elites: number of best samples that count, from 1 to ``samples``
     :param result: "best" returns the best sample of the last iteration, "mean" the weighted mean of the last elites
     :param temperature: temperature of the softmax, above 0
     :param start: how the first samples start from the actor's action; None for the prior's samples alone
