@@ -5,7 +5,9 @@ from ledgers import look_for, open_ledger, trials_of
 from optuna.storages import InMemoryStorage, RDBStorage
 from optuna.trial import TrialState
 from studies import GRACE, Clock
+from tunings import arguments, tuner_of
 
+from benchmark import tune
 from benchmark.sweeps.study_trials import KEY, distributions_of, with_seed
 from benchmark.sweeps.validation import SweepError
 
@@ -17,6 +19,22 @@ def test_a_study_is_not_opened_with_other_settings(ledger):
         open_ledger(ledger.storage, Clock(), tasks=["Reacher-v5"])
     assert len(ledger.trials()) == 3
     assert {trial.user_attrs["run"]["steps"] for trial in ledger.trials()} == {100}
+
+
+def test_a_sweep_and_a_tuning_do_not_share_a_study(ledger):
+    storage = ledger.storage
+    before = [(trial.state, trial.user_attrs) for trial in trials_of(storage)]
+    with pytest.raises(SweepError, match=r"'study': holds the trials of a sweep, or of another program\. .*--study"):
+        tuner_of(tune.parse(arguments()), storage)
+    assert [(trial.state, trial.user_attrs) for trial in trials_of(storage)] == before
+
+    other = InMemoryStorage()
+    tuner_of(tune.parse(arguments()), other)
+    with pytest.raises(SweepError, match=r"'study': holds the trials of a tuning\. .*--study"):
+        open_ledger(other, Clock())
+    assert trials_of(other) == []
+    # The same tuning goes on
+    tuner_of(tune.parse(arguments()), other)
 
 
 def test_a_study_may_get_more_seeds_and_more_of_its_methods(ledger):

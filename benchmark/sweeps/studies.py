@@ -45,6 +45,7 @@ from benchmark.sweeps.study_trials import (
     RUN,
     STOPPED,
     SWEEP,
+    TUNING,
     WORKER,
     Claim,
     attributes_of,
@@ -79,13 +80,15 @@ class Ledger(TrialWriter):
         :param sweep: the sweep
         :param description: the sweep's description, as JSON has it; its "commands", if any, join those of before
         :param ended: runs that ended elsewhere, which are not trained again
-        :raises SweepError: if the study exists with other settings
+        :raises SweepError: if the study exists with other settings, or with the trials of a tuning
         """
         try:
             self._study_id = patiently(self.storage.create_new_study, [StudyDirection.MAXIMIZE], self.name)
         except DuplicatedStudyError:
             self._study_id = None
         runs, trials = sweep.runs(), self.trials()
+        if TUNING in patiently(self.storage.get_study_user_attrs, self.study_id):
+            raise self._refusal("", "holds the trials of a tuning")
         self._distributions = distributions_of(sweep)
         if trials and trials[0].distributions == with_seed(self._distributions):
             # Optuna gives all trials of a study the same parameters

@@ -14,6 +14,8 @@ from benchmark.sweeps.runs import Run
 
 # Attributes of a study: its description, and the prefix of those that each record a command that trained runs
 SWEEP, COMMAND = "sweep", "command "
+# The attribute of a tuning's study, which has other trials: its settings
+TUNING = "tuning"
 # Attributes of a trial
 RUN, KEY, ERROR, WORKER, OUTCOME = "run", "key", "error", "worker", "outcome"
 # Outcomes of trials whose run or configuration is to be continued

@@ -23,12 +23,9 @@ from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, run_folder, trai
 from benchmark.sweeps.scoring import PRUNERS, SCORING
 from benchmark.sweeps.signals import undisturbed
 from benchmark.sweeps.storages import patiently
-from benchmark.sweeps.study_trials import ERROR, LOST, OUTCOME, STOPPED
+from benchmark.sweeps.study_trials import ERROR, LOST, OUTCOME, STOPPED, SWEEP, TUNING
 from benchmark.sweeps.tuning import ORIGIN, SCORES, Tuning
 from benchmark.sweeps.validation import SweepError
-
-# The attribute of the study that holds its settings
-TUNING = "tuning"
 
 
 class Tuner:
@@ -59,8 +56,12 @@ class Tuner:
 
     def _check(self) -> None:
         now = asdict(self._tuning)
-        was = patiently(lambda: self._study.user_attrs).get(TUNING)
+        attributes = patiently(lambda: self._study.user_attrs)
+        was = attributes.get(TUNING)
         if was is None:
+            if SWEEP in attributes or self.trials():
+                problem = "holds the trials of a sweep, or of another program. Choose another name by --study"
+                raise SweepError(f"The study {self._study.study_name!r}", "", problem)
             patiently(self._study.set_user_attr, TUNING, now)
         elif was != now:
             key = next(key for key in now if was.get(key) != now[key])
