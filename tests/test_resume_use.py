@@ -10,6 +10,7 @@ from environments import Reach
 from stable_baselines3 import TD3, HerReplayBuffer
 from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
 from trainings import SMALL, Interruption, Stop, Training, interrupted, parameters_equal
 
@@ -18,6 +19,8 @@ from sb3_cgp.resumption import TrainingCheckpointCallback
 from sb3_cgp.resumption.algorithm import resumable
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
+
+GAUSSIAN = NormalActionNoise(np.zeros(1), 0.1 * np.ones(1))
 
 
 def test_without_callbacks_states_go_on_being_saved(tmp_path):
@@ -117,6 +120,21 @@ def test_what_does_not_fit_is_refused(tmp_path):
         CGP.resume(tmp_path / "state", training.make_env(1), buffer_size=20)
     with pytest.raises(FileNotFoundError, match="nowhere"):
         CGP.resume(tmp_path / "nowhere", training.make_env(1))
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("saved", [None, GAUSSIAN], ids=["none saved", "another saved"])
+def test_action_noise_may_be_given_to_resume(saved, n_envs, tmp_path):
+    interrupted(tmp_path, action_noise=saved, n_envs=n_envs)
+    noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.5))
+    model = CGP.resume(tmp_path / "state", make_vec_env("Pendulum-v1", n_envs), action_noise=noise)
+    # Beyond the end of an episode, at which SB3 resets the noise of that environment
+    model.learn(140)
+    assert model.num_timesteps == 140
+    noises = model.action_noise.noises if n_envs > 1 else [model.action_noise]
+    assert len(noises) == n_envs
+    # Each environment has its own
+    assert len({float(each.noise_prev[0]) for each in noises}) == n_envs
 
 
 @pytest.mark.parametrize("value", [True, False])

@@ -7,11 +7,9 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
@@ -20,11 +18,11 @@ from sb3_cgp.common.rules import require, require_count, require_number
 LINEAR_SCHEDULE_PREFIX = "lin_"
 
 
-def constructor_argument_names(of: type[BaseAlgorithm] | type[BasePolicy]) -> set[str]:
+def constructor_argument_names(of: type) -> set[str]:
     """
     Return the names of the arguments that a constructor takes, those that it passes on to its bases included.
 
-    :param of: the class of an algorithm or a policy
+    :param of: the class, such as that of an algorithm, a policy or an environment
     :return: the names
     """
     names: set[str] = set()

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import torch as th
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 
@@ -48,6 +49,11 @@ def _whole(path: str | Path | io.BufferedIOBase, suffix: str) -> Iterator[Any]:
     path = Path(path)
     with whole_file(path if path.suffix and not path.is_dir() else path.with_name(path.name + suffix)) as file:
         yield file
+
+
+def _number_of_noises(noise: ActionNoise | None) -> int | None:
+    """Return for how many environments action noise is vectorised; None if it is not."""
+    return len(noise.noises) if isinstance(noise, VectorizedActionNoise) else None
 
 
 class ResumableAlgorithm(ResumableModel):
@@ -190,7 +196,10 @@ class ResumableAlgorithm(ResumableModel):
             self.set_logger(continued_logger(folder, self.num_timesteps + 1, self.verbose))
         steps_left = self._training_started_at + total_timesteps - self.num_timesteps
         result = super()._setup_learn(steps_left, callback, False, *args, **kwargs)
-        self.action_noise, self._custom_logger = action_noise, has_logger
+        self._custom_logger = has_logger
+        # Unless it was given to `resume`, and has just been adapted to the number of environments
+        if _number_of_noises(action_noise) == _number_of_noises(self.action_noise):
+            self.action_noise = action_noise
         return result
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:

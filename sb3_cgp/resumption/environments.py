@@ -34,6 +34,7 @@ from stable_baselines3.common.vec_env.stacked_observations import StackedObserva
 
 from sb3_cgp.common.rules import require
 from sb3_cgp.resumption.declarations import METHODS, find_declaration, pickle_declarations, unpickle_declarations
+from sb3_cgp.resumption.differences import require_same, warn_of_other_arguments
 from sb3_cgp.resumption.layers import is_known, layer_state, set_layer_state
 from sb3_cgp.resumption.replayed import ReplayedEnv
 
@@ -116,7 +117,8 @@ def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
     Restore the state of a vectorised environment in another one that was made in the same way.
 
     The other environment need not have been reset. Given the same actions, both then return exactly the same observations,
-    rewards, ends of episodes and infos, in this and in later episodes. Only wall-clock times differ.
+    rewards, ends of episodes and infos, in this and in later episodes. Only wall-clock times differ. A warning names
+    arguments with which the other environment was made in another way, and which are restored, too.
 
     :param env: the environment to change
     :param state: the state that :func:`environment_state` returned
@@ -124,7 +126,8 @@ def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
     """
     current, problems = _state(env)
     require(not problems, "env", env, f"restorable: {' '.join(dict.fromkeys(problems))}")
-    _require_same(current, state)
+    require_same(current, state)
+    warn_of_other_arguments(current, state)
     layers = list(_vec_layers(env))
     for layer, saved in zip(layers, state["layers"], strict=True):
         set_layer_state(layer, saved)
@@ -212,28 +215,3 @@ def _set_chain_state(env: gym.Env, state: dict[str, Any]) -> None:
     """Restore the state of an environment and its wrappers."""
     for layer, saved in zip(_chain(env), state["layers"], strict=True):
         set_layer_state(layer, saved)
-
-
-def _describe(state: dict[str, Any]) -> str:
-    """Name the classes of an environment and its wrappers, from the outermost to the innermost."""
-    vectorized, *chains = [" > ".join(layer["class"] for layer in each["layers"]) for each in (state, *state["envs"])]
-    # The environments are usually all of the same classes
-    inside = " | ".join(dict.fromkeys(chains)) if len(set(chains)) == 1 else " | ".join(chains)
-    return f"{state['num_envs']} x {vectorized}" + (f" > {inside}" if inside else "")
-
-
-def _require_same(current: dict[str, Any], saved: dict[str, Any]) -> None:
-    """Refuse the state of an environment whose classes, spaces or MuJoCo model differ."""
-    origin = "what the state was saved from"
-    require(_describe(current) == _describe(saved), "env", _describe(current), f"{origin}, {_describe(saved)!r}")
-    layers = [[layer for each in (state, *state["envs"]) for layer in each["layers"]] for state in (current, saved)]
-    for ours, theirs in zip(*layers, strict=True):
-        for part, describe in (
-            ("spaces", lambda state: state["space"]),
-            ("mujoco", lambda field: f"of shape {np.shape(field)}"),
-            ("mujoco_model", lambda field: f"of shape {np.shape(field)}"),
-        ):
-            our, their = ({name: describe(each) for name, each in layer.get(part, {}).items()} for layer in (ours, theirs))
-            for name in sorted(our.keys() | their.keys()):
-                allowed = f"{origin}, {their.get(name)!r}"
-                require(our.get(name) == their.get(name), f"{ours['class']}.{name}", our.get(name), allowed)

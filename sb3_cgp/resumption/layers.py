@@ -12,6 +12,7 @@ from gymnasium.wrappers import PassiveEnvChecker
 from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
+from sb3_cgp.common.sb3_arguments import constructor_argument_names
 from sb3_cgp.resumption.declarations import METHODS, OWN, Declaration, find_declaration
 from sb3_cgp.resumption.mujoco_data import (
     get_mujoco_data,
@@ -87,6 +88,9 @@ def layer_state(layer: Any, problems: list[str], is_replayed: bool = False) -> d
             state["attributes"] |= CHECKED
         is_declared = declaration is not None
         problems.extend(_problems(layer, name, state["attributes"].keys(), is_declared))
+    # By which a difference is noticed, as an attribute often is a value that the user gave to the constructor
+    arguments = constructor_argument_names(kind)
+    state["arguments"] = [key for key in state["attributes"] if key.removeprefix("_") in arguments]
     state["spaces"] = {key: _space_state(value) for key, value in vars(layer).items() if isinstance(value, spaces.Space)}
     data = None if is_replayed else get_mujoco_data(layer)
     if data is not None:

@@ -136,6 +136,25 @@ def from_plain(plain: Any, current: Any = None) -> Any:
     return statistics
 
 
+def equal(plain: Any, other: Any) -> bool:
+    """
+    Return whether two values are the same as plain data.
+
+    :param plain: plain data
+    :param other: other plain data
+    :return: whether both are of the same type and have equal elements; NaN equals NaN
+    """
+    if type(plain) is not type(other):
+        return False
+    if isinstance(plain, np.ndarray):
+        return plain.dtype == other.dtype and np.array_equal(plain, other, equal_nan=plain.dtype.kind in "fc")
+    if isinstance(plain, dict):
+        return plain.keys() == other.keys() and all(equal(value, other[key]) for key, value in plain.items())
+    if isinstance(plain, list | tuple):
+        return len(plain) == len(other) and all(map(equal, plain, other))
+    return bool(plain == other or (plain != plain and other != other))
+
+
 def _part(current: Any, key: Any) -> Any:
     """Return the element of a list, tuple or dictionary at an index or key, or None if there is no such element."""
     if isinstance(current, list | tuple):
