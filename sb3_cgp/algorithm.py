@@ -95,7 +95,7 @@ class CGP(
         (see :meth:`train_policy`)
     :param inference: what ``predict`` uses: the "actor", the "averaged_actor" (φ' of Algorithm 2) or "cem".
         None stands for the actor, or for CEM where there is no ``policy_loss``. Rollouts always use CEM, and so does
-        ``predict`` before the policy's offline training.
+        ``predict`` while the policy waits for its offline training, in a second ``learn`` too.
     :param actor_learning_rate: learning rate of the actor, in the same forms. None stands for ``learning_rate``.
     :param policy_delay: The actor is updated once every ``policy_delay`` gradient steps
     :param target_update_interval: The target critics and the averaged actor are updated once every
@@ -274,7 +274,8 @@ class CGP(
 
         Callbacks see each gradient step as a step in which no environment moves: ``num_timesteps`` does not change, no
         episode ends, rewards are 0. Values are logged at ``num_timesteps`` plus the number of gradient steps. A callback
-        that stops the training within its first round leaves CEM to act.
+        that stops the training before its plateau causes a warning, and the next ``learn`` goes on with it. One that stops
+        it within its first round leaves CEM to act.
 
         :param max_steps: largest number of gradient steps
         :param batch_size: observations per gradient step, by default the model's

@@ -1,10 +1,18 @@
 """The offline training of the policy: when it happens, what it changes, and what stops it."""
 
+import math
+import warnings
+
 import gymnasium as gym
 import pytest
 import torch as th
 from small_models import make_model
-from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    EvalCallback,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
+)
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -111,9 +119,40 @@ class TestOffline:
         loaded.save(tmp_path / "trained")
         assert CGP.load(tmp_path / "trained").policy.inference == "actor"
 
-    def test_a_policy_that_a_callback_stops_too_early_is_warned_of(self):
-        with pytest.warns(UserWarning, match="A callback stopped the policy's training after 7 steps: CEM acts"):
-            make_model(policy_training="offline").learn(100, callback=self.Watcher(stop_after=107))
+    # A round has ten steps here, and the plateau is after six rounds at the earliest
+    @pytest.mark.parametrize(("n_steps", "acts"), [(7, "CEM"), (17, "the actor")])
+    def test_a_policy_that_a_callback_stops_before_its_plateau_is_warned_of_and_stays_due(self, n_steps, acts):
+        model = make_model(policy_training="offline")
+        message = f"A callback stopped the policy's training after {n_steps} steps: {acts} acts"
+        with pytest.warns(UserWarning, match=message):
+            model.learn(100, callback=self.Watcher(stop_after=100 + n_steps))
+        assert model.policy.inference == {"CEM": "cem", "the actor": "actor"}[acts]
+        # Further steps of the environment are not needed
+        watcher = self.Watcher()
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            model.learn(0, callback=watcher, reset_num_timesteps=False)
+        assert len(watcher.actors) >= 60
+        assert model.learn(0, callback=self.Watcher(), reset_num_timesteps=False).policy.inference == "actor"
+
+    def test_a_callback_that_has_stopped_the_critics_training_stops_the_policys(self, tmp_path):
+        """SB3's, which goes on to find no improvement: the policy has a round and no more."""
+        stop = StopTrainingOnNoModelImprovement(max_no_improvement_evals=1)
+        evaluation = EvalCallback(make_vec_env("Pendulum-v1"), callback_after_eval=stop, eval_freq=15, n_eval_episodes=1)
+        stop.last_best_mean_reward = evaluation.best_mean_reward = math.inf
+        model = make_model(policy_training="offline", learning_starts=10)
+        with pytest.warns(UserWarning, match="A callback stopped the policy's training after 15 steps: the actor acts"):
+            model.learn(100, callback=evaluation)
+        assert model.num_timesteps < 100
+
+    def test_cem_acts_while_the_critics_learn_again(self):
+        model = make_model(policy_training="offline", cem_start="actor").learn(100)
+        watcher = self.Watcher()
+        model.learn(20, callback=watcher, reset_num_timesteps=False)
+        # The callback sees a step before its gradient step
+        assert watcher.inferences[:20] == ["actor"] + ["cem"] * 19
+        assert set(watcher.inferences[20:]) == {"actor"}
+        assert (model.policy.inference, model.policy.actor_proposes) == ("actor", True)
 
     def test_a_model_trained_online_acts_by_its_actor_when_it_is_loaded_to_train_offline(self, tmp_path):
         make_model().learn(100).save(tmp_path / "model")

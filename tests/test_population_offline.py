@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 from populations import adam_state, assert_alike, make, make_env, saved_and_loaded
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from trainings import Do
 
@@ -81,6 +82,21 @@ def test_an_agent_whose_critics_have_not_learnt_gets_no_actor():
     assert [agent.policy.inference for agent in population] == ["actor"] * 3
 
 
+def test_cem_acts_while_the_critics_learn_again():
+    seen = []
+
+    class Watcher(BaseCallback):
+        def _on_step(self):
+            seen.append([agent.policy.inference for agent in self.model])
+            return True
+
+    population = make_offline(2).learn(2 * 40)
+    population.learn(2 * 5, Watcher(), reset_num_timesteps=False)
+    # The callback sees a step before its gradient step
+    assert seen == [["actor"] * 2] + [["cem"] * 2] * 4
+    assert [agent.policy.inference for agent in population] == ["actor"] * 2
+
+
 def test_agents_are_trained_again_only_after_their_critics_have_learnt(tmp_path):
     population = make_offline(LATE).learn(3 * 40)
     loaded = saved_and_loaded(population, tmp_path)
@@ -103,7 +119,7 @@ def test_loaded_parameters_of_trained_actors_act():
     np.testing.assert_array_equal(fresh.predict(OBSERVATIONS)[0][[0, 2]], population.predict(OBSERVATIONS)[0][[0, 2]])
 
 
-def test_a_failed_agent_keeps_the_actor_that_it_had(monkeypatch):
+def test_a_failed_agent_keeps_the_actor_that_it_had_and_acts_by_its_newer_critics(monkeypatch):
     population = make_offline(2).learn(2 * 40)
     before = copy_weights(population)
     train_policy = CGP.train_policy
@@ -116,7 +132,7 @@ def test_a_failed_agent_keeps_the_actor_that_it_had(monkeypatch):
     monkeypatch.setattr(CGP, "train_policy", fail_first)
     with pytest.warns(UserWarning, match="Agent 0 has failed"):
         population.learn(2 * 10, reset_num_timesteps=False)
-    assert [agent.policy.inference for agent in population] == ["actor", "actor"]
+    assert [agent.policy.inference for agent in population] == ["cem", "actor"]
     assert [has_changed(population, before, index) for index in range(2)] == [False, True]
 
 
@@ -130,7 +146,8 @@ def test_it_resumes_as_if_it_had_not_stopped(tmp_path):
         # Before the second agent's critics learn
         train(tmp_path / "stopped", Do(12, lambda: 1 / 0))
     resumed = Population.resume(tmp_path / "stopped", make_vec_env("Pendulum-v1", 2))
-    assert [agent.policy.inference for agent in resumed] == ["actor", "cem"]
+    # The first agent's critics have learnt since its actor was trained
+    assert [agent.policy.inference for agent in resumed] == ["cem", "cem"]
     resumed.learn(2 * 30)
     for name, value in expected.policy.state_dict().items():
         assert th.equal(resumed.policy.state_dict()[name], value), name

@@ -112,7 +112,7 @@ class CGP(OffPolicyAlgorithm):
         self.target_update_interval = target_update_interval
         self.target_policy_noise = target_policy_noise
         self.target_noise_clip = target_noise_clip
-        # Whether the actor has been trained, online or offline
+        # Whether the actor has been trained, online, or offline after the critics
         self._policy_is_trained = False
         # Whether the critics have learnt since the last offline training of the policy
         self._policy_is_due = False
@@ -155,8 +155,8 @@ class CGP(OffPolicyAlgorithm):
         learns_along = self._trains_online and self._n_updates <= self.policy_delay
         return self.policy_loss is not None and (self._policy_is_trained or learns_along)
 
-    def _mark_policy(self, is_trained: bool) -> None:
-        had_actor, self._policy_is_trained = self._has_actor, is_trained
+    def _mark_policy(self, is_trained: bool, is_due: bool = False) -> None:
+        had_actor, self._policy_is_trained, self._policy_is_due = self._has_actor, is_trained, is_due
         if self._has_actor != had_actor:
             self._choose_inference()
 
@@ -181,6 +181,8 @@ class CGP(OffPolicyAlgorithm):
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
         self._update_learning_rates(self._current_progress_remaining, "critic", "actor")
+        if self.policy_training == "offline":
+            self._mark_policy(is_trained=False, is_due=True)
 
         values = defaultdict(list)
         for _ in range(gradient_steps):
@@ -221,7 +223,6 @@ class CGP(OffPolicyAlgorithm):
                 update_average(self.critic, self.critic_target, self.tau)
                 update_average(self.actor, self.actor_target, self.tau)
 
-        self._policy_is_due = self.policy_training == "offline"
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._record_means(values)
 
@@ -289,7 +290,7 @@ class CGP(OffPolicyAlgorithm):
 
         plateau, losses, was_trained = offline.Plateau(), [], self._policy_is_trained
         # Callbacks evaluate and save the actor that is being trained
-        self._mark_policy(is_trained=True)
+        self._mark_policy(is_trained=True, is_due=self._policy_is_due)
         try:
             callback = self._init_callback(callback)
             callback = with_progress_bar(callback) if progress_bar else callback
@@ -306,7 +307,7 @@ class CGP(OffPolicyAlgorithm):
                 if n_steps % self.target_update_interval == 0:
                     update_average(self.actor, self.actor_target, self.tau)
                 callback.update_locals(rollout_locals(self, callback))
-                if not callback.on_step():
+                if is_stopped := not callback.on_step():
                     break
                 if n_steps % offline.ROUND == 0:
                     self._record_means({"actor_loss": losses})
@@ -316,16 +317,15 @@ class CGP(OffPolicyAlgorithm):
                         break
                     losses = []
             else:
-                warnings.warn(
-                    f"The policy's loss has not reached a plateau in max_steps={max_steps} gradient steps.", stacklevel=2
-                )
+                warnings.warn(f"The policy's loss has not reached a plateau in max_steps={max_steps} steps.", stacklevel=2)
             # An actor that a callback stopped within its first round is of no use
             was_trained = was_trained or n_steps >= min(offline.ROUND, max_steps)
-            if not was_trained:
-                warnings.warn(f"A callback stopped the policy's training after {n_steps} steps: CEM acts.", stacklevel=2)
-            self._policy_is_due = False
+            if is_stopped:
+                acts = "the actor" if was_trained else "CEM"
+                warnings.warn(f"A callback stopped the policy's training after {n_steps} steps: {acts} acts.", stacklevel=2)
+            self._policy_is_due = is_stopped
         finally:
-            self._mark_policy(was_trained)
+            self._mark_policy(was_trained, self._policy_is_due)
         callback.on_training_end()
         if self.verbose >= 1:
             print(f"The policy was trained for {n_steps} gradient steps")

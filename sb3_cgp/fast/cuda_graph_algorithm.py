@@ -114,6 +114,9 @@ class CudaGraphAlgorithm(CGP):
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
         self._update_learning_rates(self._current_progress_remaining, "critic", "actor")
+        # This mark, and that below, are the core's `train`'s, which no replay sets
+        if self.policy_training == "offline":
+            self._mark_policy(is_trained=False, is_due=True)
         losses, n_updates_before = defaultdict(list), self._n_updates
         for _ in range(gradient_steps):
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
@@ -127,10 +130,8 @@ class CudaGraphAlgorithm(CGP):
                     losses[name].append(loss)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._unlogged.update(losses)
-        # The core's `train` notes these two, which no replay does
         if "actor_loss" in losses:
             self._mark_policy(is_trained=True)
-        self._policy_is_due = self.policy_training == "offline"
         if self._n_updates // CHECK_INTERVAL > n_updates_before // CHECK_INTERVAL:
             self._loss_watch.check()
 

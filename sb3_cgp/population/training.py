@@ -80,6 +80,10 @@ class PopulationTraining(
     def _trains_offline(self) -> bool:
         return self._policy_loss is not None and not self._trains_online
 
+    def _choose_inference(self) -> None:
+        """Let ``predict`` use the actors that are trained: `PopulationMembers` implements it."""
+        raise NotImplementedError
+
     @property
     def failed(self) -> dict[int, str]:
         """The agents whose training has failed, and why. Their parameters do not change any more."""
@@ -126,7 +130,12 @@ class PopulationTraining(
         self._update_learning_rates()
         learns = self.num_timesteps // self.n_envs > self._counts["learning_starts"]
         learns &= np.array([failure is None for failure in self._failures])
-        self._policies_due |= learns & self._trains_offline
+        # Until its offline training, as in a CGP alone
+        outdated = learns & self._trains_offline
+        self._policies_due |= outdated
+        if (self._policies_trained & outdated).any():
+            self._policies_trained &= ~outdated
+            self._choose_inference()
         n_updates_before = self._n_updates
         for _ in range(gradient_steps):
             self._n_updates += 1
