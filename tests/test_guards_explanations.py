@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from guarded import SMALL, GuardedTD3, Located, located
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
@@ -124,6 +125,48 @@ def test_an_error_of_the_environments_own_code_passes(message):
 
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         GuardedTD3("MlpPolicy", Unpacks(), **SMALL).learn(20)
+
+
+class Unpacking(gym.Wrapper):
+    def step(self, action):
+        first, _ = action.repeat(3)
+        return self.env.step(first)
+
+
+class UnpackingFive(gym.Wrapper):
+    def reset(self, *, seed=None, options=None):
+        first, *_, _, _, _, _ = np.zeros(3)
+        return self.env.reset(seed=first, options=options)
+
+
+class Assigning(gym.Wrapper):
+    def step(self, action):
+        bounds = (0, 1)
+        bounds[0] = action
+        return self.env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "message"),
+    [
+        (Unpacking, "too many values to unpack"),
+        (UnpackingFive, "not enough values"),
+        (Assigning, "'tuple' object does not support"),
+    ],
+)
+def test_an_error_of_a_wrappers_own_code_passes(wrapper, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        GuardedTD3("MlpPolicy", wrapper(Located()), **SMALL).learn(20)
+
+
+def test_an_error_of_something_else_that_is_reset_passes():
+    class ResetsNoise(gym.Wrapper):
+        def reset(self, *, seed=None, options=None):
+            NormalActionNoise(np.zeros(1), np.ones(1)).reset(indices=[0])
+            return self.env.reset(seed=seed, options=options)
+
+    with pytest.raises(TypeError, match="unexpected keyword argument 'indices'"):
+        GuardedTD3("MlpPolicy", ResetsNoise(Located()), **SMALL).learn(20)
 
 
 def hindsight(n_envs=1, length=7, **kwargs):

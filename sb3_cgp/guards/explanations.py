@@ -1,5 +1,6 @@
 """Errors of SB3's that name a symptom, and what they mean: the old API, rewards that are no numbers, too few episodes."""
 
+import linecache
 import re
 import traceback
 from collections.abc import Iterator
@@ -26,6 +27,8 @@ OLD_STEP = (
     "The environment's `step` must return five values, `observation, reward, terminated, truncated, info`, where `truncated` "
     f"means that the episode ran out of time. {OLD_API}"
 )
+# The call of an environment, of one of several, of a wrapper's base class, or of a method that replaces another
+CALL = re.compile(r"(?:env\w*|super\(\)|self)(?:\[[^]]*\])?\._?(step|reset)\(")
 NO_INFO = "The environment's `step` must return a dictionary as its last value, `info`; an empty one, `{}`, will do."
 
 
@@ -68,7 +71,7 @@ def explain(error: Exception, model: OffPolicyAlgorithm) -> str | None:
     :param model: the model that was learning
     :return: the cause and the remedy; None for an error that speaks for itself
     """
-    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    *_, (frame, line_number) = traceback.walk_tb(error.__traceback__)
     reward = _explain_reward(error, frame)
     if reward is not None:
         return f"The environment returned a reward that is not a number at environment step {model.num_timesteps}{reward}."
@@ -77,7 +80,7 @@ def explain(error: Exception, model: OffPolicyAlgorithm) -> str | None:
     # Not an error of the environment's own code, but of its callers: SB3, Gymnasium, this package, and wrappers of any package
     is_caller = frame.f_globals.get("__name__", "").startswith(("stable_baselines3.", "gymnasium.", "sb3_cgp.guards."))
     if is_caller or isinstance(frame.f_locals.get("self"), gym.Wrapper):
-        return _explain_old_api(str(error), frame.f_code.co_name)
+        return _explain_old_api(str(error), linecache.getline(frame.f_code.co_filename, line_number, frame.f_globals))
     return None
 
 
@@ -90,15 +93,14 @@ def _explain_reward(error: Exception, frame: FrameType) -> str | None:
     return None
 
 
-def _explain_old_api(error: str, function: str) -> str | None:
-    """Explain an error of unpacking what the environment returned, or of calling it."""
-    if re.search(r"values to unpack \(expected 5", error) or ("cannot unpack" in error and function == "step"):
-        return OLD_STEP
-    if re.search(r"values to unpack \(expected 2", error) or ("cannot unpack" in error and function == "reset"):
+def _explain_old_api(error: str, line: str) -> str | None:
+    """Explain an error of unpacking what the environment returned, or of calling it, in a line of code."""
+    called = CALL.search(line)
+    if called is not None and ("values to unpack" in error or "cannot unpack" in error):
+        return OLD_STEP if called[1] == "step" else OLD_RESET
+    if called is not None and re.search(r"reset\(\) (got an unexpected keyword|takes)", error):
         return OLD_RESET
-    if re.search(r"reset\(\) (got an unexpected keyword|takes)", error):
-        return OLD_RESET
-    if "does not support item assignment" in error and function in ("step", "step_wait"):
+    if "does not support item assignment" in error and "info" in line:
         return NO_INFO
     return None
 
