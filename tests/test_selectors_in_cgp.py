@@ -3,15 +3,17 @@
 import math
 from copy import deepcopy
 
+import numpy as np
 import oracles
 import pytest
 import torch as th
 from scores import Seen
 from small_models import step_without_learning
+from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
 import sb3_cgp.core.policies as core_policies
-from sb3_cgp import CEM, CGP, MlpPolicy, Selection
+from sb3_cgp import CEM, CGP, MlpPolicy, Selection, TrainingCheckpointCallback
 from sb3_cgp.fast.scoring import q_score
 from sb3_cgp.selectors import MPPI, ActorCEM, ActorOnly, ActorStart
 
@@ -207,6 +209,57 @@ def test_a_models_setting_is_saved_and_a_policys_too(tmp_path):
     policy = MlpPolicy.load(tmp_path / "policy")
     assert repr(policy.selector) == repr(model.policy.selector)
     assert policy.actor_proposes is False
+
+
+class Fixed:
+    """A selector without a comparison of its own."""
+
+    def __init__(self, action):
+        self.action = action
+
+    def select(self, score, n_states, action_dim, device="cpu"):
+        actions = th.full((n_states, action_dim), self.action, device=device)
+        return Selection(actions, actions.unsqueeze(1))
+
+
+@pytest.mark.parametrize("initial", [None, Fixed(0.2)], ids=["CEM", "the user's"])
+@pytest.mark.parametrize("way", ["save", "resume"])
+def test_a_selector_that_is_set_on_the_policy_is_saved(way, initial, tmp_path):
+    sizes = dict(cem_samples=64, cem_elites=6)
+    model = make_model(policy_kwargs=dict(net_arch=[16], selector=initial), inference="cem", **sizes)
+
+    class Exchange(BaseCallback):
+        def _on_step(self):
+            if self.n_calls == 30:
+                self.model.policy.selector = Fixed(0.7)
+            return True
+
+    model.learn(60, [Exchange(), TrainingCheckpointCallback(50, tmp_path / "state")])
+    if way == "save":
+        model.save(tmp_path / "model")
+        loaded = CGP.load(tmp_path / "model")
+    else:
+        loaded = CGP.resume(tmp_path / "state", "Pendulum-v1")
+    assert loaded.policy.selector.action == 0.7
+    observation = np.zeros(3, np.float32)
+    assert loaded.predict(observation)[0] == model.predict(observation)[0] == pytest.approx(1.4)
+    # And once more
+    loaded.save(tmp_path / "again")
+    assert CGP.load(tmp_path / "again").policy.selector.action == 0.7
+
+
+def test_other_selectors_of_a_model_that_is_loaded_are_set_on_its_policy(tmp_path):
+    make_model(policy_kwargs=dict(net_arch=[16], selector=Fixed(0.2)), cem_samples=64, cem_elites=6).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"Leave `policy_kwargs` out.*`model\.policy\.selector = "):
+        CGP.load(tmp_path / "model", policy_kwargs=dict(net_arch=[16], selector=Fixed(0.2)))
+
+
+def test_saving_leaves_the_arguments_of_cem_as_they_are(tmp_path):
+    model = make_model(**LIGHT)
+    model.cem_samples = 12
+    model.save(tmp_path / "model")
+    assert "selector" not in model.policy_kwargs
+    assert CGP.load(tmp_path / "model", cem_samples=9).policy.selector == ActorCEM(1, 9, 6)
 
 
 @pytest.mark.parametrize("policy_loss", ["cgp", "qgp"])

@@ -23,6 +23,16 @@ SelfArgumentGuard = TypeVar("SelfArgumentGuard", bound="ArgumentGuard")
 SLOTS = ("callbacks", "callback", "callback_on_new_best")
 # Arguments that populations of agents have, and no other algorithm has
 POPULATION_ARGUMENTS = {"agents", "overlap"}
+# What to do about errors of `load`, by their beginnings
+LOAD_REMEDIES = {
+    # The policy is the saved one
+    "The value of `policy` is": "Load a model of another algorithm by that algorithm's class.",
+    # SB3's
+    "The specified policy kwargs do not equal": (
+        "Leave `policy_kwargs` out, as a loaded model has those that it was saved with, and set what can be changed on its "
+        "policy, such as `model.policy.selector = ...`."
+    ),
+}
 CALLBACK = "an instance of a subclass of BaseCallback"
 
 
@@ -94,10 +104,10 @@ class ArgumentGuard(OffPolicyAlgorithm):
         try:
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except ValueError as error:
-            if not str(error).startswith("The value of `policy` is"):
+            remedy = next((text for start, text in LOAD_REMEDIES.items() if str(error).startswith(start)), None)
+            if remedy is None:
                 raise
-            # The policy is the saved one
-            raise ValueError(f"{error} Load a model of another algorithm by that algorithm's class.") from error
+            raise ValueError(f"{error} {remedy}") from error
 
 
 def check_holds(algorithm: type[OffPolicyAlgorithm], saved: SavedModel) -> None:

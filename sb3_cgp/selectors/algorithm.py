@@ -23,6 +23,7 @@ class SelectorAlgorithm(CGP):
     training itself starts from the actor that it trains.
 
     The ``changeable_arguments`` may be changed on the model, also by a callback: they are checked, and take effect at once.
+    So does another selector that is set on the policy, which is then saved with the model.
     """
 
     # The arguments of the constructor
@@ -42,6 +43,22 @@ class SelectorAlgorithm(CGP):
         require(given is None, "policy_kwargs['actor_proposes']", given, "left out: CGP sets it when the actor is trained")
         super()._setup_model()
         self._check_selector()
+        self._initial_selector = self.policy.selector
+
+    def save(self, *args: Any, **kwargs: Any) -> None:
+        """
+        Save the model, with a selector that has been set on its policy, see SB3's method.
+
+        :param args: the arguments of SB3's method
+        :param kwargs: the same arguments by keyword
+        """
+        selector = self.policy.selector
+        if selector is not self._initial_selector and selector != self._make_selector():
+            self.policy_kwargs, self._initial_selector = self.policy_kwargs | {"selector": selector}, selector
+        super().save(*args, **kwargs)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_initial_selector"]
 
     def __setattr__(self, name: str, value: Any) -> None:
         """
