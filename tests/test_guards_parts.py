@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from guarded import SMALL, GuardedTD3, Located, located
 from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_cgp import CGP
 from sb3_cgp.common.spaces import check_action_space
 from sb3_cgp.guards.parts import check_replay_buffer
 
@@ -44,11 +46,59 @@ def test_noise_that_was_given_for_other_environments_follows_too():
 
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_noise_of_another_shape_than_the_actions_is_refused(n_envs):
-    model = make_model(n_envs, action_noise=NormalActionNoise(np.zeros(3), np.ones(3)))
-    with pytest.raises(
-        ValueError, match=r"`action_noise` is .*NormalActionNoise.*, but must be noise .* shape, \(1,\), not \(3,\)"
-    ):
+    noise = NormalActionNoise(np.zeros(3), np.ones(3))
+    message = r"`action_noise` is .*NormalActionNoise.*, but must be noise .* shape, \(1,\), not \(3,\)"
+    with pytest.raises(ValueError, match=message):
+        make_model(n_envs, action_noise=noise)
+    model = make_model(n_envs)
+    model.action_noise = noise
+    with pytest.raises(ValueError, match=message):
         model.learn(12)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "message"),
+    [
+        (
+            dict(replay_buffer_class=HerReplayBuffer, replay_buffer_kwargs=dict(n_sampled_goals=4)),
+            TypeError,
+            r"`n_sampled_goals` is 4, but `HerReplayBuffer` takes no such argument.*`n_sampled_goal`",
+        ),
+        (
+            dict(replay_buffer_class=HerReplayBuffer, replay_buffer_kwargs=dict(goal_selection_strategy="futur")),
+            ValueError,
+            r"`replay_buffer_kwargs\['goal_selection_strategy'\]` is 'futur', but must be one of 'future', 'final', 'episode'",
+        ),
+        (dict(replay_buffer_kwargs=dict(n_sampled_goal=4)), TypeError, "`n_sampled_goal` is 4, but `DictReplayBuffer` takes"),
+    ],
+)
+def test_wrong_arguments_of_a_replay_buffer_are_refused_when_the_model_is_made_or_loaded(kwargs, error, message, tmp_path):
+    def make(**arguments):
+        return GuardedTD3("MultiInputPolicy", located(goals=True, length=7), **(SMALL | arguments))
+
+    with pytest.raises(error, match=message):
+        make(**kwargs)
+    make(replay_buffer_class=kwargs.get("replay_buffer_class")).save(tmp_path / "model")
+    with pytest.raises(error, match=message):
+        GuardedTD3.load(tmp_path / "model", replay_buffer_kwargs=kwargs["replay_buffer_kwargs"])
+
+
+def test_a_replay_buffer_of_the_users_own_may_take_any_argument():
+    class Own(DictReplayBuffer):
+        def __init__(self, *args, note, **kwargs):
+            super().__init__(*args, **kwargs)
+            self.note = note
+
+    arguments = dict(replay_buffer_class=Own, replay_buffer_kwargs=dict(note="kept"))
+    model = GuardedTD3("MultiInputPolicy", located(goals=True, length=7), **(SMALL | arguments))
+    assert model.replay_buffer.note == "kept"
+
+
+def test_whole_episodes_of_several_environments_are_refused():
+    message = r"`train_freq` is \(1, 'episode'\), but must be in unit 'step' with 2 environments"
+    with pytest.raises(ValueError, match=message):
+        CGP("MlpPolicy", located(2), train_freq=(1, "episode"))
+    assert CGP("MlpPolicy", located(1), train_freq=(1, "episode"), **SMALL).learn(20).num_timesteps >= 20
 
 
 @pytest.mark.parametrize(("theirs", "ours"), [(4, 1), (1, 4), (2, 3)])

@@ -75,19 +75,37 @@ def check_learning_rate(name: str, value: Any) -> None:
         require_number(name, value)
 
 
-def check_train_freq(value: Any) -> None:
+def check_train_freq(value: Any, n_envs: int = 1) -> None:
     """
     Check ``train_freq``: a number of steps, or a pair of a number and its unit.
 
     :param value: the argument's value
-    :raises ValueError: if the number is not an integer >= 1 or the unit is unknown
+    :param n_envs: number of environments
+    :raises ValueError: if the number is not an integer >= 1, or the unit is unknown, or "episode" for several environments
     """
     is_pair = isinstance(value, tuple) and len(value) == 2
     frequency, unit = value if is_pair else (value, "step")
+    unit = getattr(unit, "value", unit)
     # SB3 accepts no NumPy integer here
     require(isinstance(frequency, int), "train_freq", value, "an int, or a tuple of an int and a unit")
     require_count("train_freq", frequency)
-    require(getattr(unit, "value", unit) in ("step", "episode"), "train_freq", value, "in unit 'step' or 'episode'")
+    require(unit in ("step", "episode"), "train_freq", value, "in unit 'step' or 'episode'")
+    allowed = f"in unit 'step' with {n_envs} environments, whose episodes do not end together"
+    require(n_envs == 1 or unit == "step", "train_freq", value, allowed)
+
+
+def replay_buffer_class_of(model: OffPolicyAlgorithm) -> type[ReplayBuffer]:
+    """
+    Return the class of a model's replay buffer: the given one, or that which SB3 chooses.
+
+    :param model: the model, before its replay buffer is made
+    :return: the class
+    """
+    if model.replay_buffer_class is not None:
+        return model.replay_buffer_class
+    if isinstance(model.observation_space, spaces.Dict):
+        return DictReplayBuffer
+    return NStepReplayBuffer if model.n_steps > 1 else ReplayBuffer
 
 
 def check_off_policy_arguments(model: OffPolicyAlgorithm) -> None:
@@ -101,7 +119,7 @@ def check_off_policy_arguments(model: OffPolicyAlgorithm) -> None:
         require_count(name, getattr(model, name))
     require_count("learning_starts", model.learning_starts, minimum=0)
     require_count("gradient_steps", model.gradient_steps, minimum=-1)
-    check_train_freq(model.train_freq)
+    check_train_freq(model.train_freq, model.n_envs)
     for name in ("tau", "gamma"):
         require_number(name, getattr(model, name), high=1.0)
     check_learning_rate("learning_rate", model.learning_rate)
@@ -114,8 +132,7 @@ def check_off_policy_arguments(model: OffPolicyAlgorithm) -> None:
     allowed = "1 with a Dict observation space, for which SB3 has no n-step replay buffer"
     require(model.n_steps == 1 or not has_dict, "n_steps", model.n_steps, allowed)
     # SB3's buffers refuse these too, one of them at the first gradient step only
-    chosen = DictReplayBuffer if has_dict else NStepReplayBuffer if model.n_steps > 1 else ReplayBuffer
-    buffer_class = model.replay_buffer_class or chosen
-    is_supported = not model.optimize_memory_usage or not issubclass(buffer_class, DictReplayBuffer | NStepReplayBuffer)
+    has_no_such_mode = issubclass(replay_buffer_class_of(model), DictReplayBuffer | NStepReplayBuffer)
+    is_supported = not model.optimize_memory_usage or not has_no_such_mode
     allowed = "False with a Dict observation space or `n_steps` above 1, for which SB3's replay buffers have no such mode"
     require(is_supported, "optimize_memory_usage", model.optimize_memory_usage, allowed)

@@ -1,8 +1,10 @@
 """Parts of a model that do not fit together: replay buffers and action noise of other environments, a missing buffer."""
 
 import copy
+import inspect
 import io
 import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,11 +14,17 @@ from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cgp.common.rules import require
+from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
 from sb3_cgp.common.spaces import check_action_space
 from sb3_cgp.guards.contents import check_contents
+from sb3_cgp.guards.names import check_names
+
+# The arguments of a replay buffer that the algorithm gives
+GIVEN_BY_MODEL = {"buffer_size", "observation_space", "action_space", "device", "n_envs", "optimize_memory_usage", "env"}
 
 
 class PartsGuard(OffPolicyAlgorithm):
@@ -37,6 +45,8 @@ class PartsGuard(OffPolicyAlgorithm):
         allowed = "None or an ActionNoise, such as NormalActionNoise(np.zeros(n), 0.1 * np.ones(n)) for n action dimensions"
         is_noise = self.action_noise is None or isinstance(self.action_noise, ActionNoise)
         require(is_noise, "action_noise", self.action_noise, allowed)
+        check_action_noise_shape(self.action_noise, self.action_space)
+        check_replay_buffer_kwargs(replay_buffer_class_of(self), self.replay_buffer_kwargs)
         is_her = isinstance(self.replay_buffer_class, type) and issubclass(self.replay_buffer_class, HerReplayBuffer)
         if self.env is not None or self.replay_buffer is not None or not is_her:
             super()._setup_model()
@@ -111,6 +121,25 @@ def check_action_noise_shape(noise: ActionNoise | None, action_space: spaces.Spa
         shape = np.shape(getattr(base, name, 0.0))
         allowed = f"noise of the actions' shape, {action_space.shape}, not {shape}"
         require(_broadcasts_to(shape, action_space.shape or ()), "action_noise", noise, allowed)
+
+
+def check_replay_buffer_kwargs(buffer_class: type[ReplayBuffer], given: Mapping[str, Any]) -> None:
+    """
+    Check the arguments of a replay buffer before it is made, which a loaded model puts off.
+
+    :param buffer_class: the buffer's class; one that takes any argument is not checked
+    :param given: ``replay_buffer_kwargs``
+    :raises TypeError: if the class does not take an argument, naming it and the nearest one
+    :raises ValueError: if the strategy of hindsight replay is unknown
+    """
+    parameters = inspect.signature(buffer_class).parameters
+    if not any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
+        check_names(buffer_class.__name__, given, set(parameters) - GIVEN_BY_MODEL, {})
+    strategy = given.get("goal_selection_strategy")
+    if isinstance(strategy, str):
+        allowed = f"one of {', '.join(map(repr, KEY_TO_GOAL_STRATEGY))}"
+        is_known = strategy.lower() in KEY_TO_GOAL_STRATEGY
+        require(is_known, "replay_buffer_kwargs['goal_selection_strategy']", strategy, allowed)
 
 
 def check_replay_buffer(buffer: ReplayBuffer, model: OffPolicyAlgorithm) -> None:
