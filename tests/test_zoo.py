@@ -4,6 +4,7 @@ import argparse
 import importlib
 import inspect
 import sys
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,6 +27,7 @@ from sb3_cgp import CGP
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
 from sb3_cgp.zoo import folders
 from sb3_cgp.zoo import registration as zoo
+from sb3_cgp.zoo.checkpoints import without_checkpoints
 from sb3_cgp.zoo.search_space import VARIANTS
 
 PAPER_TASKS = {f"{task}-v{version}" for task in ("HalfCheetah", "Humanoid", "Hopper", "Pusher", "Ant") for version in (4, 5)}
@@ -220,14 +222,39 @@ def test_a_folder_that_the_user_chose_is_kept_and_none_is_given_without_a_callba
     assert experiment.callbacks == []
 
 
-def test_trials_of_optuna_save_no_states(tmp_path):
+@pytest.mark.parametrize("path", [None, "states"])
+def test_trials_of_optuna_save_no_states(path, tmp_path, monkeypatch):
+    """Two trials, which could not share a folder, with the callbacks that the file has besides."""
+    monkeypatch.chdir(tmp_path)
     zoo.register()
-    small = TINY | {"learning_starts": 10}
-    options = dict(optimize_hyperparameters=True, n_trials=1, n_timesteps=20, n_evaluations=1, n_eval_episodes=1)
+    checkpoint = {"sb3_cgp.TrainingCheckpointCallback": {"save_freq": 10, "path": path}}
+    small = TINY | {"learning_starts": 10, "callback": [checkpoint, "sb3_cgp.hparams.HParamsCallback"]}
+    options = dict(optimize_hyperparameters=True, n_trials=2, n_timesteps=20, n_evaluations=1, n_eval_episodes=1)
     experiment = manager(tmp_path, hyperparams=small, no_optim_plots=True, **options)
     assert experiment.setup_experiment() is None
-    experiment.hyperparameters_optimization()
-    assert [path for path in tmp_path.rglob("*") if path.name == "state"] == []
+    assert experiment.specified_callbacks == ["sb3_cgp.hparams.HParamsCallback"]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        experiment.hyperparameters_optimization()
+    assert not [warning for warning in caught if "state of the training" in str(warning.message)]
+    assert [path for path in tmp_path.rglob("*") if path.name in ("state", "states")] == []
+
+
+@pytest.mark.parametrize(
+    ("specified", "left"),
+    [
+        (None, []),
+        ("sb3_cgp.TrainingCheckpointCallback", []),
+        ({"sb3_cgp.resumption.callbacks.TrainingCheckpointCallback": {"save_freq": 10}}, []),
+        ("sb3_cgp.hparams.HParamsCallback", ["sb3_cgp.hparams.HParamsCallback"]),
+        (
+            [{"sb3_cgp.hparams.HParamsCallback": {}}, "sb3_cgp.TrainingCheckpointCallback"],
+            [{"sb3_cgp.hparams.HParamsCallback": {}}],
+        ),
+    ],
+)
+def test_checkpoints_are_left_out_of_every_form_of_specified_callbacks(specified, left):
+    assert without_checkpoints(specified) == left
 
 
 # What rl_zoo3's enjoy and record_video replace in models that another version of Python saved

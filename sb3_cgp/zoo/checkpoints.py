@@ -29,6 +29,22 @@ def prepare_checkpoints(experiment: Any) -> None:
         experiment.env_wrapper = functools.partial(_make_restorable, experiment.env_wrapper)
 
 
+def without_checkpoints(specified: Any) -> list[Any]:
+    """
+    Leave checkpoint callbacks out of those that a YAML file specifies, as Optuna's trials neither have a folder of their own
+    nor are resumed.
+
+    :param specified: rl_zoo3's value of ``callback``: a name, a dictionary of a name and its arguments, a callback, or a list
+    :return: the others
+    """
+    from rl_zoo3.utils import get_class_by_name
+
+    entries = specified if isinstance(specified, list) else [] if specified is None else [specified]
+    names = [next(iter(entry)) if isinstance(entry, dict) else entry for entry in entries]
+    kinds = [get_class_by_name(name) if isinstance(name, str) else type(name) for name in names]
+    return [entry for entry, kind in zip(entries, kinds, strict=True) if not issubclass(kind, TrainingCheckpointCallback)]
+
+
 def _make_restorable(env_wrapper: "Callable[[gym.Env], gym.Env] | None", env: "gym.Env") -> RestorableEnv:
     """
     Wrap an environment as rl_zoo3 would, and make it restorable.

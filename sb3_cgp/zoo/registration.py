@@ -14,7 +14,7 @@ from sb3_cgp import CGP
 from sb3_cgp.common.extras import import_from_extra
 from sb3_cgp.hparams import HParamsCallback
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
-from sb3_cgp.zoo.checkpoints import prepare_checkpoints
+from sb3_cgp.zoo.checkpoints import prepare_checkpoints, without_checkpoints
 from sb3_cgp.zoo.folders import ALGO, hyperparams_folder, state_folder
 from sb3_cgp.zoo.model_card import complete_model_cards
 from sb3_cgp.zoo.run_folders import hold_run, how_to_continue, release_run
@@ -96,8 +96,10 @@ def register_default_config() -> None:
 
     @functools.wraps(create_callbacks)
     def create_callbacks_with_folder(self: Any) -> None:
-        # Optuna's trials create their own callbacks, which save no states
-        if not self.optimize_hyperparameters:
+        if self.optimize_hyperparameters:
+            # Of which each trial makes callbacks of its own
+            self.specified_callbacks = without_checkpoints(self.specified_callbacks)
+        else:
             prepare_checkpoints(self)
         create_callbacks(self)
         has_own = any(isinstance(each, HParamsCallback) for each in self.callbacks)
