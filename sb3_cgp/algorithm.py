@@ -2,6 +2,7 @@
 
 import io
 import pathlib
+import warnings
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
@@ -343,8 +344,16 @@ class CGP(
         :raises ValueError: if a module is missing or unknown
         """
         super().set_parameters(load_path_or_dict, exact_match, device)
-        if self._n_updates == 0 and self.actor.optimizer.state:
+        if self._n_updates > 0:
+            return
+        if self.actor.optimizer.state:
             self._mark_policy(is_trained=True)
+        elif self.critic.optimizer.state and self.policy.inference != "cem":
+            warnings.warn(
+                "The critics whose parameters have been set are trained, and the actor is not: `predict` uses it nevertheless."
+                " After `load(path, policy_loss='cgp')`, CEM acts until the actor is trained.",
+                stacklevel=2,
+            )
 
     def export(self, folder: str | pathlib.Path) -> None:
         """

@@ -204,6 +204,18 @@ class TestOffline:
         assert loaded.policy.inference == "cem"
         assert loaded.train_policy().policy.inference == "actor"
 
+    def test_trained_critics_with_an_untrained_actor_are_warned_of_where_their_parameters_are_set(self):
+        parameters = make_model(policy_loss=None).learn(100).get_parameters()
+        with pytest.warns(UserWarning, match="the actor is not: `predict` uses it nevertheless"):
+            make_model().set_parameters(parameters)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            # CEM acts in these
+            make_model(policy_training="offline").set_parameters(parameters)
+            make_model(inference="cem").set_parameters(parameters)
+            # Neither has been trained
+            make_model().set_parameters(make_model(policy_loss=None).get_parameters())
+
     @pytest.mark.parametrize("way", ["file", "dictionary"])
     def test_a_trained_actor_acts_where_its_parameters_are_set(self, way, tmp_path):
         def given(model):
