@@ -4,6 +4,7 @@ import numpy as np
 import torch as th
 from environments import Doubles
 from gymnasium import spaces
+from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
@@ -108,3 +109,16 @@ def saved_and_loaded(population, folder):
     loaded = Population.load(folder / "population", env=make_env())
     loaded.load_replay_buffer(folder / "buffer")
     return loaded
+
+
+class Log(KVWriter):
+    """Keeps what is logged."""
+
+    def __init__(self):
+        self.rows = []
+
+    def write(self, key_values, key_excluded, step=0):
+        self.rows.append({**key_values, "step": step})
+
+    def close(self):
+        pass

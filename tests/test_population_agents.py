@@ -5,11 +5,13 @@ import functools
 import numpy as np
 import pytest
 import torch as th
-from populations import AGENTS, Pushed, PushedOnAxes, assert_alike, make
+from gymnasium import spaces
+from populations import AGENTS, Pushed, PushedOnAxes, assert_alike, make, make_env
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_cgp import CGP
-from sb3_cgp.population import make_population_env
+from sb3_cgp.population import Population, make_population_env
+from sb3_cgp.selectors import MPPI
 
 
 def test_an_agent_predicts_as_it_does_in_the_population():
@@ -104,3 +106,33 @@ def test_offline_training_trains_each_agents_actor_at_the_end(monkeypatch):
         target = agent.policy.select_actions(observations, agent.critic).actions
         errors = [(each.actor(observations) - target).square().mean().item() for each in (agent, before[index])]
         assert errors[0] < 0.85 * errors[1]
+
+
+def test_raw_images_are_not_scaled():
+    class Images(Pushed):
+        observation_space = spaces.Box(0, 255, (3, 6, 6), np.uint8)
+
+        def observe(self):
+            return self.np_random.integers(0, 256, (3, 6, 6), np.uint8)
+
+    observations = np.random.default_rng(0).integers(0, 256, (2, 3, 6, 6), np.uint8)
+    for scales in (True, False):
+        population = make(2, env=make_env(2, Images), policy_kwargs=dict(normalize_images=scales), policy_loss="qgp")
+        actions, _ = population.predict(observations)
+        for index, agent in enumerate(population):
+            np.testing.assert_allclose(actions[index], agent.predict(observations[index])[0], atol=1e-5)
+
+
+def test_a_selector_that_is_set_on_the_policy_is_that_of_the_agents_and_is_saved(tmp_path):
+    population = make(2)
+    population.policy.selector = MPPI(2, 6, 3)
+    assert population[1].policy.selector == MPPI(2, 6, 3)
+    population.save(tmp_path / "population")
+    loaded = Population.load(tmp_path / "population")
+    assert loaded.policy.selector == loaded[0].policy.selector == MPPI(2, 6, 3)
+
+
+def test_an_index_is_an_integer():
+    with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
+        make(2)[0:1]
+    assert make(2)[np.int64(-1)].seed == 1

@@ -5,13 +5,24 @@ import pytest
 import torch as th
 from populations import make, make_env
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_cgp import CEM, CGPPolicy
 from sb3_cgp.core.losses import POLICY_LOSSES
 from sb3_cgp.population import Population, evaluate_population
+
+ORNSTEIN_UHLENBECK = OrnsteinUhlenbeckActionNoise(np.zeros(2), np.ones(2))
+
+
+def set_on_population(name, value):
+    population = make(2)
+    before = getattr(population, name, None)
+    try:
+        setattr(population, name, value)
+    finally:
+        assert getattr(population, name, None) == before
 
 
 @pytest.mark.parametrize(
@@ -52,11 +63,17 @@ from sb3_cgp.population import Population, evaluate_population
             lambda: make(
                 [
                     dict(action_noise=NormalActionNoise(np.zeros(2), np.ones(2))),
-                    dict(action_noise=OrnsteinUhlenbeckActionNoise(np.zeros(2), np.ones(2))),
+                    dict(action_noise=ORNSTEIN_UHLENBECK),
                 ]
             ),
             "agents[1]['action_noise']",
         ),
+        (lambda: make([dict(), dict(action_noise=ORNSTEIN_UHLENBECK)]), "agents[0]['action_noise']"),
+        (lambda: make(2, action_noise=VectorizedActionNoise(ORNSTEIN_UHLENBECK, 2)), "agents[0]['action_noise']"),
+        (lambda: Population("MlpPolicy", None, 2), "env"),
+        (lambda: set_on_population("cem_iterations", 5), "cem_iterations"),
+        (lambda: set_on_population("tau", 0.9), "tau"),
+        (lambda: set_on_population("learning_rate", 0.1), "learning_rate"),
         (lambda: make(3).predict(np.zeros((2, 3))), "observation"),
         (lambda: evaluate_population(make(3), make_env(2)), "env.num_envs"),
     ],
@@ -90,3 +107,14 @@ def test_the_selector_is_unchanged():
     selector = CEM(3, 10, 2)
     population = make(2, policy_kwargs=dict(selector=selector))
     assert population.policy.selector is selector
+
+
+def test_what_is_no_argument_of_the_agents_may_be_set():
+    population = make(2)
+    population.verbose = 1
+    population.tensorboard_log = None
+    assert population.verbose == 1
+
+
+def test_seeds_count_beyond_the_range_of_a_small_integer():
+    assert [agent["seed"] for agent in make(2, seed=np.uint8(255)).agents] == [255, 256]

@@ -2,13 +2,14 @@
 
 import math
 
+import gymnasium as gym
 import numpy as np
 import pytest
-from populations import make, make_env
-from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
+from populations import Log, make, make_env
+from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, StopTrainingOnNoModelImprovement
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.logger import Logger
 
 from sb3_cgp.population import Population, PopulationEvalCallback, evaluate_population
 
@@ -49,21 +50,34 @@ def test_sb3s_callbacks_and_log_take_a_population(tmp_path):
     assert logged["eval/mean_reward"] == evaluation.last_mean_reward
 
 
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (lambda: make_env(1), r"`eval_env.num_envs` is 1, but must be 2, as many as agents"),
+        (lambda: gym.make("Pendulum-v1"), r"`eval_env` is .*, but must be a VecEnv, as `make_vec_env\(task, n_envs=2\)`"),
+    ],
+)
+def test_another_environment_is_refused_before_the_training(env, message):
+    population = make(2)
+    with pytest.raises(ValueError, match=message):
+        population.learn(2 * 30, PopulationEvalCallback(env(), eval_freq=25))
+    assert population.num_timesteps == 0
+
+
+def test_training_stops_when_the_mean_over_the_agents_no_longer_improves():
+    stop = StopTrainingOnNoModelImprovement(max_no_improvement_evals=1)
+    callback = PopulationEvalCallback(make_env(2), stop, eval_freq=5, n_eval_episodes=1, verbose=0)
+    population = make(2).learn(2 * 400, callback)
+    means = callback.mean_rewards.mean(axis=1)
+    assert callback.last_mean_reward == means[-1]
+    assert callback.best_mean_reward == means.max()
+    # The last two evaluations were no better than one before them
+    assert means[-2:].max() <= means[:-2].max()
+    assert len(means) == population.num_timesteps / 2 / 5 < 80
+
+
 def test_the_evaluation_of_a_population_refuses_a_single_agent():
     agent = make(1).agent(0, env=make_env(1))
     with pytest.raises(ValueError, match=r"`model` is 'CGP', but must be a Population.* use SB3's EvalCallback"):
         agent.learn(5, callback=PopulationEvalCallback(make_env(1)))
     assert agent.num_timesteps == 0
-
-
-class Log(KVWriter):
-    """Keeps what is logged."""
-
-    def __init__(self):
-        self.rows = []
-
-    def write(self, key_values, key_excluded, step=0):
-        self.rows.append({**key_values, "step": step})
-
-    def close(self):
-        pass

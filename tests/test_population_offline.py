@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import torch as th
-from populations import adam_state, assert_alike, make, make_env, saved_and_loaded
+from populations import Log, adam_state, assert_alike, make, make_env, saved_and_loaded
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
 from trainings import Do
 
 from sb3_cgp import CGP, TrainingCheckpointCallback
@@ -152,3 +153,58 @@ def test_it_resumes_as_if_it_had_not_stopped(tmp_path):
     for name, value in expected.policy.state_dict().items():
         assert th.equal(resumed.policy.state_dict()[name], value), name
     assert [agent.policy.inference for agent in resumed] == ["actor"] * 2
+
+
+def test_a_finished_training_is_resumed_with_its_actors(tmp_path):
+    def resume():
+        return Population.resume(tmp_path / "state", make_env(2))
+
+    population = make_offline(2, make_env(2)).learn(2 * 40, TrainingCheckpointCallback(20, tmp_path / "state"))
+    resumed = resume()
+    assert [agent.policy.inference for agent in resumed] == ["actor"] * 2
+    resumed.learn(2 * 40)
+    for name, value in population.policy.state_dict().items():
+        assert th.equal(resumed.policy.state_dict()[name], value), name
+
+
+def test_an_interrupted_offline_training_goes_on_with_the_next_actor(tmp_path, monkeypatch):
+    trained, train_policy = [], CGP.train_policy
+
+    def note(agent):
+        trained.append(agent.seed)
+        if trained == [0, 1]:
+            raise KeyboardInterrupt
+        return train_policy(agent)
+
+    monkeypatch.setattr(CGP, "train_policy", note)
+    with pytest.raises(KeyboardInterrupt):
+        make_offline(3).learn(3 * 40, TrainingCheckpointCallback(20, tmp_path / "state"))
+    resumed = Population.resume(tmp_path / "state", make_env(3))
+    assert [agent.policy.inference for agent in resumed] == ["actor", "cem", "cem"]
+    resumed.learn(3 * 40)
+    assert trained == [0, 1, 1, 2]
+
+
+def test_each_agents_log_has_its_index_and_follows_the_environments_steps():
+    population, log = make_offline(2, policy_loss="qgp"), Log()
+    population.set_logger(Logger(None, [log]))
+    population.learn(2 * 40)
+    for index in range(2):
+        steps = [row["step"] for row in log.rows if f"train/actor_loss/agent_{index}" in row]
+        assert steps[:3] == [90, 100, 110]
+    assert not any("train/actor_loss" in row for row in log.rows)
+
+
+def test_the_failure_of_all_actors_is_an_error(monkeypatch):
+    def fail(agent):
+        raise ValueError("The actor loss is nan.")
+
+    monkeypatch.setattr(CGP, "train_policy", fail)
+    with (
+        pytest.warns(UserWarning, match="Agent . has failed") as caught,
+        pytest.raises(ValueError, match=r"All agents have failed\. Agent 1: The actor loss is nan"),
+    ):
+        make_offline(2).learn(2 * 40)
+    first, second = (str(warning.message) for warning in caught if "has failed" in str(warning.message))
+    assert first.endswith("The other agents go on.")
+    assert second.endswith("nan.")

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_cgp.algorithm import CGP
@@ -63,7 +63,8 @@ def merge_arguments(agents: int | Sequence[Arguments], common: Arguments) -> lis
     for each in (common, *agents):
         check_constructor_arguments(each)
     seed = common.get("seed")
-    seeds = [{} if seed is None else {"seed": seed + index} for index in range(len(agents))]
+    # NumPy's integers may overflow
+    seeds = [{} if seed is None else {"seed": int(seed) + index} for index in range(len(agents))]
     # JSON, in which SB3 saves, has no tuples
     merged = [_with_plain_train_freq(_with_plain_seed(common | seeds[index] | own)) for index, own in enumerate(agents)]
     for name in COMMON:
@@ -178,17 +179,25 @@ def join_action_noise(agents: Sequence[CGP]) -> VectorizedActionNoise | None:
 
     :param agents: the agents, all with noise of the same class, or none of them; without noise stands for a zero Gaussian
     :return: the noise of the environments; None if no agent has any
-    :raises ValueError: if the agents' noises are of different classes
+    :raises ValueError: if the agents' noises are of different classes, or of several environments
     """
     noises = [agent.action_noise for agent in agents]
-    given = [noise for noise in noises if noise is not None]
-    if not given:
+    if all(noise is None for noise in noises):
         return None
+    for index, noise in enumerate(noises):
+        is_of_one = not isinstance(noise, VectorizedActionNoise)
+        allowed = "the noise of one agent: a population gives a copy to each"
+        require(is_of_one, f"agents[{index}]['action_noise']", noise, allowed)
+    first, given = next((index, noise) for index, noise in enumerate(noises) if noise is not None)
     zeros = th.zeros(agents[0].action_space.shape or ()).numpy()
-    joined = [NormalActionNoise(zeros, zeros) if noise is None else noise for noise in noises]
-    for index, noise in enumerate(joined):
-        allowed = f"of agent 0's class, {type(joined[0]).__name__}"
-        require(type(noise) is type(joined[0]), f"agents[{index}]['action_noise']", noise, allowed)
-    vectorized = VectorizedActionNoise(joined[0], len(joined))
+    joined: list[ActionNoise] = []
+    for index, noise in enumerate(noises):
+        stands_for_none = noise is None and isinstance(given, NormalActionNoise)
+        own = NormalActionNoise(zeros, zeros) if stands_for_none else noise
+        allowed = f"of agent {first}'s class, {type(given).__name__}, with standard deviation 0 for no noise"
+        require(type(own) is type(given), f"agents[{index}]['action_noise']", noise, allowed)
+        assert own is not None
+        joined.append(own)
+    vectorized = VectorizedActionNoise(given, len(joined))
     vectorized.noises = joined
     return vectorized

@@ -36,6 +36,9 @@ from sb3_cgp.resumption.algorithm import ResumableAlgorithm
 
 SelfPopulation = TypeVar("SelfPopulation", bound="Population")
 
+# The arguments that are fixed when a population is made. SB3 and the user may set the others on it.
+FIXED = {*OWN, *COMMON} - {"seed", "action_noise", "policy_kwargs", "stats_window_size", "tensorboard_log", "verbose"}
+
 
 class Population(ResumableAlgorithm, PopulationMembers):
     """
@@ -103,6 +106,11 @@ class Population(ResumableAlgorithm, PopulationMembers):
 
     def _setup_model(self) -> None:
         n_agents = len(self)
+        # `load` sets the spaces where there is no environment
+        has_space = getattr(self, "observation_space", None) is not None
+        require(
+            has_space, "env", None, "the name of an environment, or a VecEnv with one for each agent: only `load` needs none"
+        )
         self._check_env()
         check_supported(self.policy_class, self.agents[0])
         check_observations(self.observation_space)
@@ -128,6 +136,33 @@ class Population(ResumableAlgorithm, PopulationMembers):
         self._counts = {name: np.array([getattr(agent, name) for agent in agents]) for name in names}
         self._recorded = {}
         self._unlogged = {}
+        self._initial_selector = self.policy.selector
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """
+        Set an attribute, unless it is an argument of the agents, whose change would have no effect.
+
+        :param name: the attribute's name
+        :param value: its value
+        :raises ValueError: if the population is made and the attribute is an argument of the agents
+        """
+        allowed = "left as it is in a population that is made: make another one, or set it on `population.agent(i, env)`"
+        require(name not in FIXED or "_initial_selector" not in vars(self), name, value, allowed)
+        super().__setattr__(name, value)
+
+    def save(self, *args: Any, **kwargs: Any) -> None:
+        """
+        Save the population, with a selector that has been set on its policy, see SB3's method.
+
+        :param args: the arguments of SB3's method
+        :param kwargs: the same arguments by keyword
+        """
+        selector = self.policy.selector
+        if selector is not self._initial_selector:
+            policy_kwargs = {**(self.agents[0].get("policy_kwargs") or {}), "selector": selector}
+            self.agents = [arguments | {"policy_kwargs": policy_kwargs} for arguments in self.agents]
+            self.policy_kwargs, self._initial_selector = policy_kwargs, selector
+        super().save(*args, **kwargs)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
@@ -172,7 +207,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
     ) -> SelfPopulation:
         """
         Learn as SB3's algorithms do. With offline training, train the actors at the end, one after another: those of the
-        agents whose critics have learnt.
+        agents whose critics have learnt. Callbacks take no part in that; a state of the training is saved after each actor.
 
         :param total_timesteps: number of steps of all environments together
         :param callback: callback(s) called at every step with state of the algorithm.
@@ -183,12 +218,12 @@ class Population(ResumableAlgorithm, PopulationMembers):
         :return: the trained population
         :raises ValueError: if all agents have failed
         """
-        super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        self._report_failures()
-        # A loaded population has no transitions if a callback stopped `learn` at its first step
-        if self.replay_buffer is not None and self.replay_buffer.size() > 0:
-            self._train_policies()
-        return self
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _on_policy_trained(self) -> None:
+        # So that a resumed population does not train this actor again
+        for each in self._checkpoints():
+            each.save()
 
     @classmethod
     def load(
@@ -230,7 +265,8 @@ class Population(ResumableAlgorithm, PopulationMembers):
         super().set_env(make_agents_env(env, len(self)), force_reset)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_schedules", "_numbers", "_counts", "_recorded", "_unlogged"]
+        made = ["_schedules", "_numbers", "_counts", "_recorded", "_unlogged", "_initial_selector"]
+        return [*super()._excluded_save_params(), *made]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy"], []

@@ -28,7 +28,7 @@ def evaluate_population(population: Population, env: VecEnv, n_eval_episodes: in
     """
     n_agents = len(population)
     require_count("n_eval_episodes", n_eval_episodes)
-    require(env.num_envs == n_agents, "env.num_envs", env.num_envs, f"{n_agents}, as many as agents")
+    check_eval_env("env", env, population)
     returns: list[list[float]] = [[] for _ in range(n_agents)]
     lengths: list[list[int]] = [[] for _ in range(n_agents)]
 
@@ -46,6 +46,20 @@ def evaluate_population(population: Population, env: VecEnv, n_eval_episodes: in
     # SB3 shares the episodes out evenly among the environments
     evaluate_policy(population, env, n_eval_episodes * n_agents, callback=collect, warn=False)
     return np.array(returns), np.array(lengths)
+
+
+def check_eval_env(name: str, env: Any, population: Population) -> None:
+    """
+    Check that each agent of a population can be evaluated in an environment of its own.
+
+    :param name: the argument's name
+    :param env: the environment
+    :param population: the population
+    :raises ValueError: if it is no ``VecEnv``, or has another number of environments than the population agents
+    """
+    n_agents = len(population)
+    require(isinstance(env, VecEnv), name, env, f"a VecEnv, as `make_vec_env(task, n_envs={n_agents})` makes it")
+    require(env.num_envs == n_agents, f"{name}.num_envs", env.num_envs, f"{n_agents}, as many as agents")
 
 
 class PopulationEvalCallback(EventCallback):
@@ -83,10 +97,15 @@ class PopulationEvalCallback(EventCallback):
         self.evaluations_timesteps: list[int] = []
         self.evaluations_results: list[np.ndarray] = []
         self.evaluations_length: list[np.ndarray] = []
+        # As SB3's callbacks after an evaluation expect them: the mean over all agents
+        self.last_mean_reward = self.best_mean_reward = -np.inf
 
     def _init_callback(self) -> None:
         allowed = "a Population, whose agents PopulationEvalCallback evaluates: use SB3's EvalCallback for a single agent"
-        require(isinstance(self.model, Population), "model", type(self.model).__name__, allowed)
+        population = self.model
+        require(isinstance(population, Population), "model", type(population).__name__, allowed)
+        assert isinstance(population, Population)
+        check_eval_env("eval_env", self.eval_env, population)
 
     @property
     def mean_rewards(self) -> np.ndarray:
@@ -111,9 +130,11 @@ class PopulationEvalCallback(EventCallback):
                 ep_lengths=np.array(self.evaluations_length),
             )
         means = returns.mean(axis=1)
+        self.last_mean_reward = float(means.mean())
+        self.best_mean_reward = max(self.best_mean_reward, self.last_mean_reward)
         if self.verbose >= 1:
             print(f"Eval num_timesteps={self.num_timesteps}, mean rewards of the agents: {np.round(means, 2)}")
-        self.logger.record("eval/mean_reward", float(means.mean()))
+        self.logger.record("eval/mean_reward", self.last_mean_reward)
         self.logger.record("eval/best_mean_reward", float(means.max()))
         self.logger.record("eval/worst_mean_reward", float(means.min()))
         self.logger.record("eval/mean_ep_length", float(lengths.mean()))

@@ -1,10 +1,12 @@
 """The agents of a population as ordinary CGPs."""
 
+import operator
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_cgp.algorithm import CGP
@@ -12,6 +14,31 @@ from sb3_cgp.common.random_state import preserved_random_state
 from sb3_cgp.population.agents import make_agent
 from sb3_cgp.population.overlap import OverlappedTraining
 from sb3_cgp.population.replay import copied_column
+
+SelfMembers = TypeVar("SelfMembers", bound="PopulationMembers")
+
+
+class AgentLogger(Logger):
+    """
+    The log of one agent: to the outputs of the population's, with the agent's index in the keys.
+
+    :param logger: the population's logger
+    :param index: the agent's index
+    """
+
+    def __init__(self, logger: Logger, index: int):
+        super().__init__(logger.dir, logger.output_formats)
+        self._index = index
+
+    def record(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
+        """
+        Log a value of the agent's.
+
+        :param key: the key, to which the index is added
+        :param value: the value
+        :param exclude: outputs to leave out
+        """
+        super().record(f"{key}/agent_{self._index}", value, exclude)
 
 
 class PopulationMembers(OverlappedTraining):
@@ -63,7 +90,7 @@ class PopulationMembers(OverlappedTraining):
         :return: the agent
         :raises IndexError: if there is no such agent
         """
-        index = range(len(self))[index]
+        index = range(len(self))[operator.index(index)]
         agent = self._make_agent(index)
         if env is not None:
             agent.set_env(env)
@@ -76,6 +103,7 @@ class PopulationMembers(OverlappedTraining):
         with preserved_random_state(self.device):
             agent = make_agent(self.policy_class, self.agents[index], *spaces, self.device)  # type: ignore[arg-type]
         self.policy.copy_to(agent, index)
+        agent.policy.selector = self.policy.selector
         agent.num_timesteps = self.num_timesteps // len(self)
         agent._n_updates = int(self._agent_updates[index])
         agent._current_progress_remaining = self._current_progress_remaining
@@ -85,13 +113,35 @@ class PopulationMembers(OverlappedTraining):
         agent._choose_inference()
         return agent
 
+    def learn(self: SelfMembers, *args: Any, **kwargs: Any) -> SelfMembers:
+        """
+        Learn, and train the actors that are due offline at the end.
+
+        :param args: the arguments of SB3's method
+        :param kwargs: the same arguments by keyword
+        :return: the trained population
+        :raises ValueError: if all agents have failed
+        """
+        super().learn(*args, **kwargs)
+        self._report_failures()
+        # A loaded population has no transitions if a callback stopped `learn` at its first step
+        if self.replay_buffer is not None and self.replay_buffer.size() > 0:
+            self._train_policies()
+            self._report_failures()
+        return self
+
+    def _on_policy_trained(self) -> None:
+        """Do what is to be done after each actor's offline training."""
+
     def _train_policies(self) -> None:
         """Train the actors that are due offline, each by its own CGP."""
         for index in sorted(set(np.flatnonzero(self._policies_due).tolist()) - set(self.failed)):
             agent = self._make_agent(index)
             assert self.replay_buffer is not None
             agent.replay_buffer = copied_column(self.replay_buffer, index)
-            agent.set_logger(self.logger)
+            # The axis of the log continues after the steps of all environments
+            agent.num_timesteps = self.num_timesteps
+            agent.set_logger(AgentLogger(self.logger, index))
             try:
                 self.policy.copy_actor_from(agent.train_policy(), index)
             except ValueError as error:
@@ -100,3 +150,4 @@ class PopulationMembers(OverlappedTraining):
                 continue
             self._policies_trained[index], self._policies_due[index] = True, False
             self._choose_inference()
+            self._on_policy_trained()

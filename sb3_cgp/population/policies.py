@@ -48,9 +48,10 @@ class PopulationPolicy(BasePolicy):
     recorded_selection: Callable[[SelectFunction, th.Tensor], th.Tensor] | None = None
 
     def __init__(self, observation_space: spaces.Box, action_space: spaces.Box, agents: Sequence[CGP]):
-        super().__init__(observation_space, action_space, squash_output=True)
-        self.features_extractor = self.make_features_extractor()
         first = agents[0]
+        scales = first.policy.normalize_images
+        super().__init__(observation_space, action_space, squash_output=True, normalize_images=scales)
+        self.features_extractor = self.make_features_extractor()
         self.n_agents = len(agents)
         self.selector = first.policy.selector
         self.inference = first.policy.inference

@@ -209,7 +209,8 @@ class PopulationTraining(
     def _note_failure(self, index: int, reason: str) -> None:
         """Note why an agent has failed, and warn of it."""
         self._failures[index] = reason
-        warnings.warn(f"Agent {index} has failed. {reason} The other agents go on.", stacklevel=2)
+        others = " The other agents go on." if None in self._failures else ""
+        warnings.warn(f"Agent {index} has failed. {reason}{others}", stacklevel=2)
 
     def _record_losses(self) -> None:
         """Log the means of the last losses over the agents that learn."""

@@ -144,6 +144,11 @@ class TrainingCheckpointCallback(BaseCallback):
             self._save()
         self.signals.restore()
 
+    def save(self) -> None:
+        """Save the state now: after a training within ``learn`` that calls no callbacks, as a population's of its actors."""
+        if self.path is not None:
+            self._save()
+
     def get_training_state(self) -> dict[str, int]:
         """
         Return the counters.
