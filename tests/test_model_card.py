@@ -4,13 +4,16 @@ import re
 import runpy
 import sys
 
+import gymnasium as gym
 import pytest
 import yaml
+from gymnasium.envs.registration import EnvSpec
 from huggingface_hub import HfApi, repocard
 from rl_zoo3.train import train
 
 from sb3_cgp import CGP
 from sb3_cgp.zoo import register
+from sb3_cgp.zoo.model_card import _registering_import
 
 
 @pytest.fixture
@@ -113,3 +116,18 @@ def test_registering_twice_completes_once():
     save = repocard.metadata_save
     register()
     assert repocard.metadata_save is save
+
+
+@pytest.mark.parametrize(
+    ("entry_point", "line"),
+    [
+        ("panda_gym.envs:PandaReachEnv", "import panda_gym  # registers Mine-v0\n"),
+        ("mine:Env", "import mine  # registers Mine-v0\n"),
+        ("gymnasium.envs.classic_control.pendulum:PendulumEnv", ""),
+        (lambda: None, ""),
+    ],
+)
+def test_the_package_that_registers_the_environment_is_imported(entry_point, line, monkeypatch):
+    monkeypatch.setitem(gym.registry, "Mine-v0", EnvSpec("Mine-v0", entry_point))
+    assert _registering_import("Mine-v0") == line
+    assert _registering_import("Unknown-v0") == ""

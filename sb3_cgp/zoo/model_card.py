@@ -9,6 +9,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
 from sb3_cgp import CGP, __version__
 from sb3_cgp.common.extras import how_to_install
 from sb3_cgp.zoo.folders import ALGO
@@ -41,7 +43,7 @@ python -m rl_zoo3.enjoy --algo cgp --env {env_id} -f logs/
 ## Usage (with Python)
 
 ```python
-from huggingface_hub import hf_hub_download
+{registering_import}from huggingface_hub import hf_hub_download
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy{vec_normalize_import}
 
@@ -95,6 +97,14 @@ def complete_model_cards() -> None:
     repocard.metadata_save = metadata_save
 
 
+def _registering_import(env_id: str) -> str:
+    """Return the line that imports the package which registers an environment; an empty one for Gymnasium's own."""
+    spec = gym.registry.get(env_id)
+    entry_point = None if spec is None else spec.entry_point
+    package = entry_point.split(".")[0].split(":")[0] if isinstance(entry_point, str) else "gymnasium"
+    return "" if package == "gymnasium" else f"import {package}  # registers {env_id}\n"
+
+
 def _is_of_cgp(path: Path, data: dict[str, Any]) -> bool:
     """
     Return whether a card is one of rl_zoo3's for CGP.
@@ -131,6 +141,7 @@ def _card(path: Path, data: dict[str, Any]) -> str:
         "repo_option": "" if folder.name == model_name else f" -name {folder.name}",
         "file": model_name.filename,
         "result": result["metrics"][0]["value"],
+        "registering_import": _registering_import(result["dataset"]["name"]),
         "vec_normalize": "",
         "vec_normalize_import": "",
     }
