@@ -150,6 +150,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         entry = tuning.entry(best)
         scores = ", ".join(f"{score:.4g}" for score in best.user_attrs[SCORES])
         summary = f"benchmark.tune, trial {best.number}: {args.score} of {args.seeds} seeds {best.values[0]:.4g} ({scores})"
+        summary += ", which selected it and overestimate it: compare with other seeds"
         print(summary, *(f"  {name}: {value!r}" for name, value in sorted(entry.items())), sep="\n")
         if args.write is not None:
             write_entry(args.write, tuning.task, entry, summary)

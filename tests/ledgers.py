@@ -8,8 +8,8 @@ from benchmark.sweeps.studies import Ledger
 
 
 def open_ledger(storage, clock, **sweep):
-    ledger = Ledger(storage, "study", GRACE, clock)
-    ledger.open(make_sweep(**({"methods": ["Good"], "seeds": 3} | sweep)), {"experiment": "tiny"})
+    ledger, made = Ledger(storage, "study", GRACE, clock), make_sweep(**({"methods": ["Good"], "seeds": 3} | sweep))
+    ledger.open(made, {"experiment": "tiny", "settings_in_words": "; ".join(made.changes)})
     return ledger
 
 

@@ -1,6 +1,7 @@
 """The verdicts on the paper's claims, on runs whose truth is known."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -269,6 +270,15 @@ def test_a_small_difference_is_not_rounded_to_none(find: Any) -> None:
     assert found.verdict == CONTRADICTED
     assert found.text.startswith("range 0.0048 against TD3's 0.0008: wider by 0.0040 (0.00")
     assert "(0.000 " not in found.text
+
+
+def test_nothing_is_said_where_nothing_was_learnt(find: Any, tmp_path: Path) -> None:
+    """All runs return the same, as those of a sparse reward."""
+    rates = [{"learning rate": rate} for rate in (0.01, 0.001)]
+    families = ["CGP-Online", "CGP-Offline", "QGP-Online", "QGP-Offline", "CEM", "TD3", "SAC", "DDPG"]
+    constant = [replace(run, returns=[-50.0] * len(run.returns)) for run in runs(lambda *_: -50.0, families, rates)]
+    table = score_table([read_study(write_study(tmp_path / "sweep", constant))])
+    assert {finding.verdict for finding in findings(table, None, 50)} == {NO_DATA}
 
 
 @pytest.mark.parametrize("seeds", [1, 2, 3])

@@ -354,6 +354,22 @@ def test_longer_runs_replace_shorter_ones_only_if_they_have_all_their_methods(tm
     assert isinstance(score_table(without_side_runs([trial, whole, long])), pd.DataFrame)
 
 
+@pytest.mark.parametrize(("seeds", "replaced"), [(1, False), (3, False), (4, True), (5, True)])
+def test_longer_runs_replace_shorter_ones_only_if_they_are_enough(seeds: int, replaced: bool, tmp_path: Path) -> None:
+    """Five runs of each method on two tasks, and a longer study of one of the tasks."""
+
+    def of(name: str, tasks: list[str], seeds: int, steps: int) -> Study:
+        pairs = [(method, task) for method in ("CGP-Online", "CGP-Light") for task in tasks]
+        records = [record(method, seed, 50.0 + seed, task, steps=steps) for method, task in pairs for seed in range(seeds)]
+        return study(tmp_path, records, name)
+
+    short, long = of("short", ["Hopper-v5", "Ant-v5"], 5, 500), of("long", ["Hopper-v5"], seeds, 1_000)
+    kept = without_side_runs([short, long])
+    assert kept[0].tasks == (["Ant-v5"] if replaced else ["Hopper-v5", "Ant-v5"])
+    # What is left out is not missing
+    assert "No runs of both have ended" not in light_section(kept)
+
+
 @pytest.mark.parametrize(
     ("methods", "changed", "kept"),
     [

@@ -21,6 +21,18 @@ def test_a_study_is_not_opened_with_other_settings(ledger):
     assert {trial.user_attrs["run"]["steps"] for trial in ledger.trials()} == {100}
 
 
+def test_further_seeds_and_methods_have_the_hyperparameters_of_the_first(ledger):
+    # Of the same configuration, though none of these runs is in the study
+    with pytest.raises(SweepError, match=r"'study': hyperparams: was .* and is now .*'gamma': 0\.5.* for Good.*--study"):
+        open_ledger(ledger.storage, Clock(), seeds=[3, 4], hyperparams={"gamma": 0.5})
+    with pytest.raises(SweepError, match=r"'study': --set: was not given and is now \{'gamma': 0\.5\}.*--study"):
+        open_ledger(ledger.storage, Clock(), methods=["Other"], changes=["hyperparams {'gamma': 0.5}"])
+    assert len(ledger.trials()) == 3
+    # Other changes do not name hyperparameters
+    open_ledger(ledger.storage, Clock(), seeds=4, changes=["evaluation_episodes 1"])
+    assert len(ledger.trials()) == 4
+
+
 def test_a_sweep_and_a_tuning_do_not_share_a_study(ledger):
     storage = ledger.storage
     before = [(trial.state, trial.user_attrs) for trial in trials_of(storage)]

@@ -35,7 +35,8 @@ COST_MARGIN = 0.1
 
 RULES = f"""\
 Rewards are compared as shares of their task's range, from 0 for the lowest return of any evaluation to 1 for the best final
-reward, and averaged over tasks. Methods are compared on the configurations that all of them ran. A claim is *{SUPPORTED}*
+reward, and averaged over tasks, without those on which all returns are the same. Methods are compared on the configurations
+that all of them ran. A claim is *{SUPPORTED}*
 or *{CONTRADICTED}* if the whole 95 % interval lies on its side or on the other, *{NOT_DECIDED}* if not, or if a method or a
 configuration has fewer than {FEWEST_RUNS} runs; of several parts, all must be supported, and one is enough to contradict.
 The intervals are those of *How to read this page*, which few seeds make too narrow. The interquartile range, which measures
@@ -57,6 +58,8 @@ def findings(table: pd.DataFrame, runtime: dict[str, Any] | None, repetitions: i
     :param repetitions: number of bootstrap samples
     :return: a finding per claim
     """
+    # Where all returns are the same, nothing has been learnt, and all methods are equal
+    table = table[table.groupby("task")["share"].transform("max") > 0]
     swept = table[table["settings"] != ""]
     return [
         Finding("best or second best on every task", best_or_second(table[table["settings"] == ""])),

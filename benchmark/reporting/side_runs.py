@@ -1,15 +1,18 @@
 """Runs that are shown by themselves, but do not count where studies are taken together: short trials and variations."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 from benchmark.common.records import Record
+from benchmark.reporting.estimates import FEWEST_RUNS
 from benchmark.reporting.scores import Study
 
 SIDE_RUNS_RULE = (
-    "Shorter runs of an experiment on a task are left out of them where longer ones have all of their methods. So are runs of "
-    "a study with other hyperparameters, where another study has runs of the same length of all their methods and of others."
+    "Shorter runs of an experiment on a task are left out of them where longer ones have all of their methods, with as many "
+    f"runs or {FEWEST_RUNS}. So are runs of a study with other hyperparameters, where another study has runs of the same "
+    "length of all their methods and of others."
 )
 
 
@@ -20,19 +23,20 @@ def without_side_runs(studies: Sequence[Study]) -> list[Study]:
     :param studies: the studies
     :return: the studies without such runs, as :data:`SIDE_RUNS_RULE` defines them; those that have no others are left out
     """
-    by_steps: dict[tuple[str, str], dict[int, set[str]]] = {}
+    by_steps: dict[tuple[str, str], dict[int, Counter[str]]] = {}
     by_study: dict[tuple[str, str, int], dict[str, set[str]]] = {}
     for study in studies:
         for record in study.records:
             of_steps = by_steps.setdefault((record.experiment, record.task), {})
-            of_steps.setdefault(record.steps, set()).add(record.method)
+            of_steps.setdefault(record.steps, Counter())[record.method] += 1
             of_study = by_study.setdefault((record.experiment, record.task, record.steps), {})
             of_study.setdefault(study.name, set()).add(record.method)
     configurations = {study.name: study.facts.get("configurations", {}) for study in studies}
 
     def is_trial(record: Record) -> bool:
-        methods = by_steps[record.experiment, record.task]
-        return any(steps > record.steps and methods[record.steps] <= longer for steps, longer in methods.items())
+        numbers = by_steps[record.experiment, record.task]
+        enough = Counter({method: min(number, FEWEST_RUNS) for method, number in numbers[record.steps].items()})
+        return any(steps > record.steps and enough <= longer for steps, longer in numbers.items())
 
     def is_variation(record: Record, name: str) -> bool:
         methods = by_study[record.experiment, record.task, record.steps]
@@ -43,7 +47,10 @@ def without_side_runs(studies: Sequence[Study]) -> list[Study]:
     for study in studies:
         records = [record for record in study.records if not is_trial(record) and not is_variation(record, study.name)]
         if records:
-            kept.append(replace(study, records=records))
+            # A task without runs yet is still planned
+            left_out = {record.task for record in study.records} - {record.task for record in records}
+            tasks = [task for task in study.facts["tasks"] if task not in left_out]
+            kept.append(replace(study, records=records, facts=study.facts | {"tasks": tasks}))
     return kept
 
 

@@ -7,6 +7,7 @@ A file's keys are the fields of :class:`~benchmark.sweeps.sweep_files.SweepFile`
 import functools
 import itertools
 import math
+import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,6 +23,8 @@ from benchmark.sweeps.runs import Run, checkpoint_interval
 from benchmark.sweeps.sweep_files import Hyperparams, Inclusion, Method, Packages, SweepFile
 from benchmark.sweeps.validation import SweepError, read_yaml, validated
 
+# The names of this project's sweeps
+OWN_NAMES = re.compile(r"e\d+(-.*)?")
 # Fields that the page takes from the runs: a later command may add some, and names its own alone
 RECOMPUTED = ("tasks", "seeds")
 
@@ -144,7 +147,11 @@ def find_sweep_file(name: str) -> Path:
     problem = problem_of(name)
     if problem is not None:
         raise SweepError(name, "", problem)
-    return sweep_path(name)
+    path = sweep_path(name)
+    if OWN_NAMES.fullmatch(path.stem) and path.resolve().parent != sweeps_folder():
+        # The page would take it for one of these, and its runs for data on the paper's claims
+        raise SweepError(path, "", "must have another name: e1, e2 and so on are this project's sweeps")
+    return path
 
 
 def experiments_in_words() -> str:

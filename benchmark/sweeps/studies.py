@@ -57,6 +57,9 @@ from benchmark.sweeps.study_trials import (
 from benchmark.sweeps.trial_writer import TrialWriter
 from benchmark.sweeps.validation import SweepError
 
+# The beginning of the hyperparameters of all methods among a sweep's changes
+SET = "hyperparams "
+
 
 class Ledger(TrialWriter):
     """
@@ -87,8 +90,10 @@ class Ledger(TrialWriter):
         except DuplicatedStudyError:
             self._study_id = None
         runs, trials = sweep.runs(), self.trials()
-        if TUNING in patiently(self.storage.get_study_user_attrs, self.study_id):
+        attributes = patiently(self.storage.get_study_user_attrs, self.study_id)
+        if TUNING in attributes:
             raise self._refusal("", "holds the trials of a tuning")
+        self._check_changes(sweep, attributes.get(SWEEP))
         self._distributions = distributions_of(sweep)
         if trials and trials[0].distributions == with_seed(self._distributions):
             # Optuna gives all trials of a study the same parameters
@@ -106,17 +111,28 @@ class Ledger(TrialWriter):
         if trials and trials[0].distributions != self._distributions:
             raise self._refusal("", "has other methods, tasks or axes")
         present = {trial.user_attrs[KEY]: trial.user_attrs[RUN] for trial in trials}
+        # Further seeds of a configuration must have its hyperparameters, too
+        of_cells = {(run["task"], Run(**run).configuration): run for run in present.values()}
         for run in runs:
-            was, now = present.get(run.key), json.loads(json.dumps(asdict(run)))
-            if was is not None and was != now:
-                # Hyperparameters last, as the number of random steps may follow from the number of steps
-                names = sorted(now, key=lambda name: name == "hyperparams")
-                name = next(name for name in names if was.get(name) != now[name])
+            was, now = present.get(run.key, of_cells.get((run.task, run.configuration))), json.loads(json.dumps(asdict(run)))
+            # Hyperparameters last, as the number of random steps may follow from the number of steps
+            names = sorted(now.keys() - {"seed"}, key=lambda name: (name == "hyperparams", name))
+            name = None if was is None else next((name for name in names if was.get(name) != now[name]), None)
+            if was is not None and name is not None:
                 raise self._refusal(name, f"was {was.get(name)!r} and is now {now[name]!r} for {run.key}")
         for name in ("steps", "evaluation_interval", "evaluation_episodes") if trials else ():
             before, after = trials[0].user_attrs[RUN][name], getattr(runs[0], name)
             if before != after:
                 raise self._refusal(name, f"was {before!r} and is now {after!r}")
+
+    def _check_changes(self, sweep: Sweep, description: dict[str, Any] | None) -> None:
+        """Refuse other hyperparameters of all methods than those of earlier commands, whose methods may be others."""
+        if description is None:
+            return
+        now = next((change for change in sweep.changes if change.startswith(SET)), "")
+        _, found, was = description.get("settings_in_words", "").partition(SET)
+        if f"{found}{was}".split("; ")[0] != now.split("; ")[0]:
+            raise self._refusal("--set", f"was {was or 'not given'} and is now {now.removeprefix(SET) or 'not given'}")
 
     def _refusal(self, key: str, problem: str) -> SweepError:
         return SweepError(f"The study {self.name!r}", key, f"{problem}. Choose another name by --study")
