@@ -1,5 +1,7 @@
 """The replay buffer: float32 in whichever of SB3's classes, and the same training as with float64."""
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from environments import Doubles
 from gymnasium import spaces
 from stable_baselines3 import TD3, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cgp import CGP
@@ -136,6 +139,81 @@ def test_dict_and_hindsight_replay_narrow_what_is_float64_and_nothing_else(buffe
     assert dtypes.pop("image") == np.uint8
     assert set(dtypes.values()) == {np.dtype(np.float32)}
     assert model._n_updates == 30
+
+
+class OrderedParts(Doubles):
+    """Whose keys are not in alphabetical order."""
+
+    observation_space = spaces.Dict(
+        [("velocity", spaces.Box(-np.inf, np.inf, (2,), np.float64)), ("angle", spaces.Box(-np.inf, np.inf, (2,), np.float32))]
+    )
+
+    def observe(self):
+        return {"velocity": self.np_random.normal(size=2), "angle": self.np_random.normal(size=2).astype(np.float32)}
+
+
+def test_the_keys_of_observations_keep_their_order():
+    """A features extractor may depend on it."""
+    seen = []
+
+    class Extractor(BaseFeaturesExtractor):
+        def __init__(self, observation_space):
+            super().__init__(observation_space, features_dim=4)
+
+        def forward(self, observations):
+            seen.append(tuple(observations))
+            return th.cat(list(observations.values()), dim=1)
+
+    kwargs = dict(net_arch=[8], features_extractor_class=Extractor)
+    CGP("MultiInputPolicy", OrderedParts(), policy_kwargs=kwargs, **SMALL).learn(40)
+    assert set(seen) == {("velocity", "angle")}
+    assert list(float32_space(OrderedParts.observation_space)) == ["velocity", "angle"]
+
+
+class Annealing(ReplayBuffer):
+    """A buffer whose argument changes along the training, as that of a prioritised one."""
+
+    def __init__(self, *args, beta, weights, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.beta, self.weights = beta, weights
+
+    def sample(self, *args, **kwargs):
+        self.beta += 0.1
+        return super().sample(*args, **kwargs)
+
+
+def test_a_buffer_of_the_users_own_is_loaded_with_what_has_changed(tmp_path):
+    arguments = dict(beta=0.4, weights=np.ones(3))
+    model = make_model(Doubles(), replay_buffer_class=Annealing, replay_buffer_kwargs=arguments).learn(40)
+    beta = model.replay_buffer.beta
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = CGP.load(tmp_path / "model", env=Doubles())
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert loaded.replay_buffer.beta == beta > 0.4
+
+
+def test_the_strategy_of_hindsight_may_be_written_in_any_case(tmp_path):
+    kwargs = dict(goal_selection_strategy="Future")
+    model = make_model(Goals(), "MultiInputPolicy", replay_buffer_class=HerReplayBuffer, replay_buffer_kwargs=kwargs)
+    model.learn(40).save_replay_buffer(tmp_path / "buffer")
+    model.load_replay_buffer(tmp_path / "buffer")
+
+
+def test_a_loaded_buffer_of_other_bounds_is_not_taken_for_one_that_is_normalised_now(tmp_path):
+    class Bounded(Doubles):
+        def __init__(self, bound):
+            self.observation_space = spaces.Box(-bound, bound, (3,), np.float32)
+
+        def observe(self):
+            return np.zeros(3, np.float32)
+
+    make_model(Bounded(1)).learn(40).save_replay_buffer(tmp_path / "buffer")
+    model = make_model(Bounded(2))
+    model.load_replay_buffer(tmp_path / "buffer")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(40)
 
 
 def test_the_buffer_is_sb3s_own_for_whoever_loads_it(tmp_path):

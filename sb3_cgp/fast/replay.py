@@ -3,6 +3,7 @@
 import io
 import pathlib
 import warnings
+from collections import OrderedDict
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,7 +31,8 @@ def float32_space(space: spaces.Space) -> spaces.Space:
     :return: the same space with float32 in place of wider floating-point types; other types do not change
     """
     if isinstance(space, spaces.Dict):
-        return spaces.Dict({key: float32_space(subspace) for key, subspace in space.items()})
+        # Gymnasium sorts the keys of a plain dictionary, and networks may depend on their order
+        return spaces.Dict(OrderedDict((key, float32_space(subspace)) for key, subspace in space.items()))
     if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and space.dtype.itemsize > 4:
         # Bounds beyond float32's are infinite in it
         with np.errstate(over="ignore"):
@@ -104,9 +106,13 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
 
     def _stored_space(self) -> spaces.Space:
         """Return the observation space with the data types in which observations are stored."""
+        return self.observation_space if self._is_normalized else float32_space(self.observation_space)
+
+    @property
+    def _is_normalized(self) -> bool:
+        """Whether the environment normalises observations."""
         normalizer = self.get_vec_normalize_env()
-        is_normalized = normalizer is not None and normalizer.norm_obs
-        return self.observation_space if is_normalized else float32_space(self.observation_space)
+        return normalizer is not None and normalizer.norm_obs
 
     def _chooses_n_step_returns(self, buffer_class: type[ReplayBuffer]) -> bool:
         """Return whether the model's ``n_steps`` and ``gamma`` are the buffer's, as where the user gave no class."""
@@ -117,7 +123,7 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
             # `set_env` has added or removed VecNormalize
             if self.replay_buffer.size() == 0:
                 self.replay_buffer = None
-            elif self._stored_space() == self.observation_space:
+            elif self._is_normalized and self._stored_space() == self.observation_space:
                 message = "The replay buffer has observations in float32, and `env` normalises them now: those near their"
                 warnings.warn(
                     f"{message} mean may have lost their differences. Train a new model to keep these.", stacklevel=2
@@ -156,10 +162,11 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         fits = kinds[0] is kinds[1] or not set(kinds) <= set(SB3_BUFFERS)
         allowed = f"a {self._buffer_class.__name__}, by the model's `replay_buffer_class`, `n_steps` and observation space"
         require(fits, "replay_buffer", type(buffer).__name__, f"{allowed}: load the model with those of the saved one")
-        settings = {"optimize_memory_usage": self.optimize_memory_usage} | self.replay_buffer_kwargs
-        for name, value in settings.items():
+        # A class of the user's own may change its arguments along the training
+        kwargs = self.replay_buffer_kwargs if kinds[0] in SB3_BUFFERS else {}
+        for name, value in {"optimize_memory_usage": self.optimize_memory_usage, **kwargs}.items():
             stored = getattr(buffer, name, value)
-            value = KEY_TO_GOAL_STRATEGY.get(value, value) if isinstance(value, str) else value
+            value = KEY_TO_GOAL_STRATEGY.get(value.lower(), value) if isinstance(value, str) else value
             require(stored == value, f"replay_buffer.{name}", stored, f"{value}, as in the model's arguments")
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
