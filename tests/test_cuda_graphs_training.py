@@ -77,7 +77,23 @@ def change_selector_in_place(model):
     model.policy.selector.elites = 3
 
 
-@pytest.mark.parametrize("change", [change_gamma, change_selector, change_selector_in_place])
+def change_batch_size(model):
+    model.batch_size = 5
+
+
+def freeze_a_layer(model):
+    next(model.critic.parameters()).requires_grad_(False)
+
+
+def change_weight_decay(model):
+    for group in model.critic.optimizer.param_groups:
+        group["weight_decay"] = 0.1
+
+
+CHANGES = [change_gamma, change_selector, change_selector_in_place, change_batch_size, freeze_a_layer, change_weight_decay]
+
+
+@pytest.mark.parametrize("change", CHANGES)
 def test_a_changed_setting_is_recorded_anew(stand_in, change):
     model = make_model(target_update_interval=1).learn(60)
     assert StandIn.made == 2
