@@ -11,7 +11,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from torch import nn
 
-from sb3_cgp import CGP
+from sb3_cgp import CGP, MlpPolicy
 from sb3_cgp.common.extras import how_to_install
 
 
@@ -155,6 +155,28 @@ def test_statistics_that_are_not_there_are_missed(tmp_path):
     loaded.set_env(model.get_env())
     loaded.export(tmp_path / "export")
     assert CGP.load_weights(tmp_path / "export").network.is_normalized
+
+
+def test_an_actor_of_other_layers_is_refused_by_name(tmp_path):
+    class Normalising(MlpPolicy):
+        def make_actor(self, features_extractor=None):
+            actor = super().make_actor(features_extractor)
+            actor.mu.insert(1, nn.LayerNorm(actor.mu[0].out_features))
+            return actor
+
+    with pytest.raises(ValueError, match=r"(?s)`actor` is .*LayerNorm.*must be of the layers that SB3's actor has"):
+        make_model(policy=Normalising).export(tmp_path)
+
+
+@pytest.mark.usefixtures("no_onnx")
+def test_keys_to_normalise_may_be_a_tuple(tmp_path):
+    boxes = {key: spaces.Box(-1, 1, (2,)) for key in ("a", "z")}
+    normalize = dict(norm_obs_keys=("z", "a"))
+    model = make_model(spaces.Dict(boxes), policy="MultiInputPolicy", normalize=normalize)
+    model.export(tmp_path)
+    observations = observations_of(model)
+    expected, _ = model.predict(model.get_vec_normalize_env().normalize_obs(observations))
+    np.testing.assert_allclose(CGP.load_weights(tmp_path).predict(observations)[0], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("missing", ["onnx", "onnxscript", "onnxruntime", "safetensors"])

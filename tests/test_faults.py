@@ -8,6 +8,7 @@ import signal
 import stat
 import threading
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -263,6 +264,17 @@ def test_observations_out_of_bounds_are_warned_of_once(normalised):
     assert len(warned) == 1
     assert r"step 14: value -5.5 at index (2,), where the bounds are [-5.0, 5.0]" in str(warned[0].message)
     assert model.num_timesteps == 60
+
+
+def test_normalised_images_are_not_out_of_bounds():
+    """VecNormalize gives them a space of floats within ±clip_obs, which the images are not in before."""
+    space = spaces.Box(0, 255, (3, 6, 6), np.uint8)
+    env = VecNormalize(DummyVecEnv([lambda: Failing(with_observation(np.full((3, 6, 6), 200, np.uint8)), 3, space)]))
+    env.venv.envs[0].observe = lambda: np.full((3, 6, 6), 200, np.uint8)
+    model = CGP("MlpPolicy", env, **(SMALL | dict(policy_kwargs=dict(net_arch=[4], normalize_images=False))))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(30)
 
 
 def test_the_bounds_of_each_part_of_an_observation_are_watched():

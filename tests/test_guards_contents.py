@@ -4,12 +4,14 @@ import re
 
 import numpy as np
 import pytest
+import torch as th
 from guarded import SMALL, GuardedTD3, located
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cgp import CGP
-from sb3_cgp.guards.contents import ROWS
+from sb3_cgp.fast.device_replay import DeviceReplayBuffer
+from sb3_cgp.guards.contents import ROWS, check_contents
 
 
 def filled(n_envs=1, algorithm=CGP, n=20, **arguments):
@@ -81,3 +83,22 @@ def test_observations_of_a_dict_are_named_by_their_key():
     model.replay_buffer.observations["achieved_goal"][3] = np.nan
     with pytest.raises(ValueError, match=re.escape("replay_buffer.observations['achieved_goal'][3]` is nan")):
         model.learn(4)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("actions", 2.0, "actions[4]` is 2.0, but must be scaled"),
+        ("rewards", np.nan, "rewards[4]` is nan, but must be finite"),
+    ],
+)
+def test_a_buffer_on_the_models_device_is_checked_too(name, value, message):
+    spaces = make_vec_env("Pendulum-v1").observation_space, make_vec_env("Pendulum-v1").action_space
+    buffer = DeviceReplayBuffer(20, *spaces, th.device("cpu"))
+    for _ in range(9):
+        transition = (np.zeros((1, 3), np.float32), np.zeros((1, 3), np.float32), np.zeros((1, 1), np.float32))
+        buffer.add(*transition, np.zeros(1), np.zeros(1), [{}])
+    check_contents(buffer)
+    getattr(buffer, name)[4] = value
+    with pytest.raises(ValueError, match=re.escape(message)):
+        check_contents(buffer)

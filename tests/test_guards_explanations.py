@@ -159,6 +159,16 @@ def test_an_error_of_a_wrappers_own_code_passes(wrapper, message):
         GuardedTD3("MlpPolicy", wrapper(Located()), **SMALL).learn(20)
 
 
+def test_a_vectorised_environment_of_another_interface_is_told_what_to_return():
+    class Five(DummyVecEnv):
+        def step_wait(self):
+            observations, rewards, dones, infos = super().step_wait()
+            return observations, rewards, dones, np.zeros_like(dones), infos
+
+    with pytest.raises(ValueError, match=r"`step_wait` must return four values.*`TimeLimit\.truncated`"):
+        GuardedTD3("MlpPolicy", Five([Located]), **SMALL).learn(20)
+
+
 def test_an_error_of_something_else_that_is_reset_passes():
     class ResetsNoise(gym.Wrapper):
         def reset(self, *, seed=None, options=None):

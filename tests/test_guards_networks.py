@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from torch import nn
 
-from sb3_cgp import CGP, Selection
+from sb3_cgp import CGP, MlpPolicy, Selection
 from sb3_cgp.guards import GuardedAlgorithm
 from sb3_cgp.guards.networks import NetworkGuard
 
@@ -89,6 +89,22 @@ def test_a_features_extractor_that_fails_is_refused_at_construction(extractor, a
     with pytest.raises(ValueError, match=rf"(?s){expected}") as caught:
         make_model(extractor, **arguments)
     assert caught.value.__cause__ is not None
+
+
+@pytest.mark.parametrize(
+    ("frozen", "arguments"),
+    [("actor", dict(policy_loss=None)), ("critic", dict(policy_training="offline"))],
+)
+def test_networks_that_are_frozen_on_purpose_are_taken(frozen, arguments, tmp_path):
+    class Frozen(MlpPolicy):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            getattr(self, frozen).requires_grad_(False)
+
+    model = CGP(Frozen, located(), **(SMALL | arguments))
+    model.save(tmp_path / "model")
+    loaded = CGP.load(tmp_path / "model")
+    assert not any(parameter.requires_grad for parameter in getattr(loaded, frozen).parameters())
 
 
 @pytest.mark.parametrize("extractor", [Extractor, Caching])

@@ -38,6 +38,7 @@ from sb3_cgp.export.description import (
     FORMAT_VERSION,
     ONNX_FILE,
     TENSORS_FILE,
+    make_actor,
 )
 from sb3_cgp.export.normalization import statistics_names
 from sb3_cgp.export.onnx_file import make_onnx, named_inputs, run_onnx
@@ -92,6 +93,7 @@ def export_policy(model: ExportableModel, folder: str | Path) -> None:
     safetensors_torch, *_ = (import_from_extra(name, "export", PURPOSE) for name in names)
     normalizer = _normalizer(model)
     description = _describe(model, normalizer)
+    _check_layers(_acting_actor(model), description, model)
     tensors = _tensors(model, normalizer)
     policy = build(description, tensors)
     observations = _observations(policy.observation_space, normalizer)
@@ -173,7 +175,7 @@ def _describe(model: ExportableModel, normalizer: VecNormalize | None) -> dict[s
         normalization = {
             "epsilon": float(normalizer.epsilon),
             "clip_obs": clip_obs if np.isfinite(clip_obs) else None,
-            "keys": normalizer.norm_obs_keys,
+            "keys": None if normalizer.norm_obs_keys is None else list(normalizer.norm_obs_keys),
         }
     return {
         "format": FORMAT,
@@ -191,6 +193,13 @@ def _describe(model: ExportableModel, normalizer: VecNormalize | None) -> dict[s
         "inference": policy.inference,
         "normalization": normalization,
     }
+
+
+def _check_layers(actor: Actor, description: dict[str, Any], model: ExportableModel) -> None:
+    """Check that an actor has the layers that its description says, and no others."""
+    described = make_actor(description["network"], model.observation_space, model.action_space)  # type: ignore[arg-type]
+    found, expected = (list(network.state_dict()) for network in (actor, described))
+    require(found == expected, "actor", actor.mu, f"of the layers that SB3's actor has to be exported, {described.mu}")
 
 
 def _acting_actor(model: ExportableModel) -> Actor:

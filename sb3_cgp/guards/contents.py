@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
@@ -16,31 +17,30 @@ def check_contents(buffer: ReplayBuffer) -> None:
     """
     Check that the numbers in a replay buffer are finite, and actions scaled.
 
-    A buffer whose arrays are on a GPU is not checked.
-
     :param buffer: the replay buffer
     :raises ValueError: naming the array, the first row that breaks the rule, and the remedy
     """
     size = buffer.size()
     for name, array in _arrays(buffer):
-        if array.dtype.kind != "f":
+        is_float = array.is_floating_point() if isinstance(array, th.Tensor) else array.dtype.kind == "f"
+        if not is_float:
             continue
         is_actions = name == "actions" and isinstance(buffer.action_space, spaces.Box)
         for first in range(0, size, ROWS):
-            rows = array[first : min(first + ROWS, size)]
+            rows: Any = array[first : min(first + ROWS, size)]
             # A comparison with NaN is false
-            is_wrong = ~(np.abs(rows) <= 1.0 + 1e-6) if is_actions else ~np.isfinite(rows)
+            is_wrong = ~(abs(rows) <= 1.0 + 1e-6) if is_actions else ~(abs(rows) < np.inf)
             if is_wrong.any():
-                row = int(np.argwhere(is_wrong)[0][0])
+                row = int(th.as_tensor(is_wrong).nonzero()[0][0])
                 allowed = SCALED if is_actions else "finite: leave out the transition"
                 value = rows[is_wrong][0]
                 raise ValueError(f"The value in `replay_buffer.{name}[{first + row}]` is {value}, but must be {allowed}.")
 
 
-def _arrays(buffer: ReplayBuffer) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the arrays of transitions, those of ``Dict`` observations by key."""
+def _arrays(buffer: ReplayBuffer) -> Iterator[tuple[str, np.ndarray | th.Tensor]]:
+    """Yield the arrays of transitions, those of ``Dict`` observations by key; of a buffer on a GPU, the tensors."""
     for name in ("observations", "next_observations", "actions", "rewards"):
         # A memory-efficient buffer has no next observations
         value: Any = getattr(buffer, name, None)
         named = {f"{name}['{key}']": each for key, each in value.items()} if isinstance(value, dict) else {name: value}
-        yield from ((each, array) for each, array in named.items() if isinstance(array, np.ndarray))
+        yield from ((each, array) for each, array in named.items() if isinstance(array, np.ndarray | th.Tensor))

@@ -29,6 +29,10 @@ OLD_STEP = (
 )
 # The call of an environment, of one of several, of a wrapper's base class, or of a method that replaces another
 CALL = re.compile(r"(?:env\w*|super\(\)|self)(?:\[[^]]*\])?\._?(step|reset)\(")
+OLD_VEC_STEP = (
+    "The vectorised environment's `step_wait` must return four values, `observations, rewards, dones, infos`, as SB3's do: "
+    "`dones` are ends of any kind, and the info of an episode that ran out of time has `TimeLimit.truncated` True."
+)
 NO_INFO = "The environment's `step` must return a dictionary as its last value, `info`; an empty one, `{}`, will do."
 
 
@@ -96,6 +100,8 @@ def _explain_reward(error: Exception, frame: FrameType) -> str | None:
 def _explain_old_api(error: str, line: str) -> str | None:
     """Explain an error of unpacking what the environment returned, or of calling it, in a line of code."""
     called = CALL.search(line)
+    if called is not None and "values to unpack (expected 4" in error:
+        return OLD_VEC_STEP
     if called is not None and ("values to unpack" in error or "cannot unpack" in error):
         return OLD_STEP if called[1] == "step" else OLD_RESET
     if called is not None and re.search(r"reset\(\) (got an unexpected keyword|takes)", error):

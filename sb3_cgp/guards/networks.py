@@ -145,7 +145,9 @@ def _try_training(network: th.nn.Module, call: Callable[[], Any], shape: tuple[i
     outputs = call()
     for output in outputs:
         _require_shape(output, shape)
-    sum(output.sum() for output in outputs).backward()
+    # A network that is frozen on purpose has none
+    if any(parameter.requires_grad for parameter in network.parameters()):
+        sum(output.sum() for output in outputs).backward()
 
 
 def _require_shape(output: th.Tensor, shape: tuple[int, ...]) -> None:

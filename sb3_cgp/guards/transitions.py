@@ -50,7 +50,7 @@ def make_checks(observation_space: spaces.Space) -> list[Check]:
 
     Each raises a ``ValueError`` that names the value and the step, or warns. None may change the transition.
 
-    :param observation_space: the observation space
+    :param observation_space: the space of the observations before their normalisation, for the warning about bounds
     :return: the checks
     """
     return [
@@ -223,7 +223,9 @@ class TransitionGuard(OffPolicyAlgorithm):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
         result = super()._setup_learn(*args, **kwargs)
-        self._checks = make_checks(self.observation_space)
+        # VecNormalize's own space has the bounds of normalised observations, which are not checked
+        normalizer = self._vec_normalize_env
+        self._checks = make_checks(self.observation_space if normalizer is None else normalizer.venv.observation_space)
         self._check_first_observations()
         return result
 
