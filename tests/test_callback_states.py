@@ -220,3 +220,80 @@ def test_the_fingerprint_of_a_value_is_that_of_a_copy_and_of_nothing_else(value)
     ]
     assert fingerprint(value) == fingerprint(copy.deepcopy(value)) is not None
     assert fingerprint(value) not in map(fingerprint, others)
+
+
+class Deriving(BaseCallback):
+    """Derives attributes from its arguments, and counts its initialisations and steps."""
+
+    def __init__(self, folder, limit):
+        super().__init__()
+        self.path = f"{folder}/best"
+        self.threshold = 2 * limit
+        self.seen = self.initialised = 0
+
+    def _init_callback(self):
+        self.initialised += 1
+
+    def _on_step(self):
+        self.seen += 1
+        return True
+
+
+@pytest.mark.parametrize("with_checkpoint", [True, False])
+def test_what_a_callback_derives_from_its_arguments_follows_the_new_ones(with_checkpoint, tmp_path):
+    def checkpoint():
+        return TrainingCheckpointCallback(10, tmp_path / "state")
+
+    model = CGP("MlpPolicy", "Pendulum-v1", **TINY)
+    model.learn(30, [Deriving("old", 3), StopTrainingOnMaxEpisodes(2), checkpoint()])
+    assert model.num_timesteps == 30
+    new, stop = Deriving("new", 4), StopTrainingOnMaxEpisodes(4)
+    model = CGP.resume(tmp_path / "state", "Pendulum-v1")
+    model.learn(150, [new, stop, *([checkpoint()] if with_checkpoint else [])])
+    assert (new.path, new.threshold) == ("new/best", 8)
+    # What was counted goes on
+    assert new.seen == model.num_timesteps == 4 * 25
+    assert new.initialised == 1
+
+
+def test_what_a_callback_has_from_an_earlier_training_is_kept(tmp_path):
+    def train(model, callback, steps, **kwargs):
+        model.learn(steps, [callback, TrainingCheckpointCallback(10, tmp_path / "state")], **kwargs)
+
+    first, model = Watch(counts_from=20), CGP("MlpPolicy", "Pendulum-v1", **TINY)
+    model.learn(30, first)
+    found = first.found
+    # Nothing changes in the second training
+    first.counts_from = None
+    train(model, first, 20, reset_num_timesteps=False)
+    again = Watch()
+    CGP.resume(tmp_path / "state", "Pendulum-v1").learn(20, again, reset_num_timesteps=False)
+    assert again.found == found == {"steps": [30]}
+
+
+def test_declared_states_may_be_anything_that_is_plain_data(tmp_path):
+    class Random(Declaring):
+        def set_training_state(self, state):
+            self.state = state
+
+    state = {"generator": np.random.default_rng(3), "seen": deque([1, 2], maxlen=3), "kinds": {"a"}}
+    CGP("MlpPolicy", "Pendulum-v1", **TINY).learn(20, [Random(state), TrainingCheckpointCallback(10, tmp_path / "state")])
+    expected, restored = state["generator"].random(), Random(None)
+    CGP.resume(tmp_path / "state", "Pendulum-v1").learn(30, restored)
+    assert restored.state["generator"].random() == expected
+    assert (restored.state["seen"], restored.state["kinds"]) == (deque([1, 2], maxlen=3), {"a"})
+    with pytest.raises(ValueError, match=r"Random.get_training_state\(\) returned .*object.*, but must return plain data"):
+        CGP("MlpPolicy", "Pendulum-v1", **TINY).learn(
+            20, [Random({"other": object()}), TrainingCheckpointCallback(10, tmp_path / "other")]
+        )
+
+
+def test_another_evaluation_environment_is_warned_of_by_its_callback(tmp_path):
+    def evaluation(n_envs):
+        return EvalCallback(make_vec_env("Pendulum-v1", n_envs), eval_freq=15, n_eval_episodes=2, verbose=0)
+
+    CGP("MlpPolicy", "Pendulum-v1", **TINY).learn(20, [evaluation(1), TrainingCheckpointCallback(10, tmp_path / "state")])
+    other = evaluation(2)
+    with pytest.warns(UserWarning, match=r"EvalCallback's `eval_env` is not the saved one, .*'2 x .*'1 x"):
+        CGP.resume(tmp_path / "state", "Pendulum-v1").learn(40, other)
+    assert other.n_calls == 40

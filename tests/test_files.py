@@ -1,6 +1,9 @@
 """Writing results."""
 
 import errno
+import os
+import stat
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -52,3 +55,21 @@ def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path, monke
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(("number", "is_passed_on"), [(errno.EINVAL, False), (errno.ENOTSUP, False), (errno.EIO, True)])
+def test_a_file_system_that_flushes_no_folders_is_no_error(
+    number: int, is_passed_on: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As that of some shared folders of virtual machines."""
+    fsync = os.fsync
+
+    def flush(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(number, os.strerror(number))
+        fsync(descriptor)
+
+    monkeypatch.setattr("os.fsync", flush)
+    with pytest.raises(OSError, match=str(tmp_path)) if is_passed_on else nullcontext():
+        write_atomically(tmp_path / "file", b"content")
+    assert (tmp_path / "file").read_bytes() == b"content"

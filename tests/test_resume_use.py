@@ -1,5 +1,6 @@
 """Using resumption: what goes on, what is kept, and what is refused."""
 
+import shutil
 import signal
 import warnings
 
@@ -185,3 +186,41 @@ def test_callbacks_keep_their_new_arguments_and_their_old_counters(tmp_path):
     model.learn(60, callback=[TrainingCheckpointCallback(10, tmp_path / "state"), evaluation])
     assert (evaluation.eval_freq, evaluation.n_eval_episodes, evaluation.n_calls) == (1_000, 1, 60)
     assert evaluation.best_mean_reward == max(map(np.mean, training.evaluation.evaluations_results))
+
+
+def events_of(folder):
+    return sorted(path.name for path in folder.iterdir() if any(path.glob("events.*")))
+
+
+def tiny(**kwargs):
+    return CGP("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(net_arch=[8]), **(SMALL | kwargs))
+
+
+def test_tensorboard_goes_on_in_the_trainings_folder_or_in_a_new_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tiny(tensorboard_log="log").learn(30, TrainingCheckpointCallback(10, "state"))
+    # Of another training
+    tiny(tensorboard_log="log").learn(30)
+    assert events_of(tmp_path / "log") == ["CGP_1", "CGP_2"]
+    of_another = sorted((tmp_path / "log" / "CGP_2").iterdir())
+
+    def resume(**kwargs):
+        return CGP.resume("state", "Pendulum-v1", **kwargs)
+
+    resume().learn(40)
+    assert len(list((tmp_path / "log" / "CGP_1").iterdir())) == 2
+    # Another folder
+    resume(tensorboard_log="other").learn(50)
+    assert events_of(tmp_path / "other") == ["CGP_1"]
+    # The folder is gone, as on another machine
+    shutil.rmtree(tmp_path / "log" / "CGP_1")
+    shutil.rmtree(tmp_path / "other" / "CGP_1")
+    resume(tensorboard_log="log").learn(60)
+    assert events_of(tmp_path / "log") == ["CGP_2", "CGP_3"]
+    assert sorted((tmp_path / "log" / "CGP_2").iterdir()) == of_another
+
+
+def test_tensorboard_that_is_given_to_resume_alone_is_written_there(tmp_path):
+    tiny().learn(30, TrainingCheckpointCallback(10, tmp_path / "state"))
+    CGP.resume(tmp_path / "state", "Pendulum-v1", tensorboard_log=str(tmp_path / "log")).learn(40)
+    assert events_of(tmp_path / "log") == ["CGP_1"]

@@ -181,6 +181,18 @@ def test_a_policys_training_that_the_keyboard_interrupted_goes_on(monkeypatch, t
     assert_same(outcome(tmp_path / "stopped"), outcome(tmp_path / "straight"))
 
 
+def test_a_run_that_was_killed_before_it_saved_its_last_model_goes_on(monkeypatch, tmp_path):
+    """Its model is that of an earlier interruption, and its states reach the end."""
+    start(monkeypatch, command(tmp_path))
+    run = run_of(tmp_path)
+    final = CGP.load(run / "Pendulum-v1.zip")
+    final.num_timesteps = 100
+    final.save(run / "Pendulum-v1.zip")
+    assert max(StateStore(run / "state").steps()) == 330
+    resume(run)
+    assert CGP.load(run / "Pendulum-v1.zip").num_timesteps == 330
+
+
 def test_states_in_a_folder_of_the_users_choice_are_found(monkeypatch, tmp_path, capsys):
     states = tmp_path / "states"
     chosen = CHECKPOINT.replace("64", f"64, path='{states}'")

@@ -99,6 +99,17 @@ def test_what_is_not_data_is_refused_by_its_place(tmp_path, state, message):
     assert StateStore(tmp_path).steps() == []
 
 
+@pytest.mark.parametrize("axes", [(0, 1, 2), (2, 1, 0), (1, 2, 0), (0, 2, 1)])
+def test_arrays_keep_their_order_in_memory(axes, tmp_path):
+    """In which NumPy adds numbers, so that sums are the same to the bit."""
+    array = np.random.default_rng(0).normal(size=(3, 4, 5)).transpose(axes).copy(order="K")
+    StateStore(tmp_path).save(1, {"array": array, "one": np.asfortranarray(np.ones((1, 4)))})
+    _, state = StateStore(tmp_path).load()
+    assert state["array"].strides == array.strides
+    assert np.array_equal(state["array"], array)
+    assert state["one"].shape == (1, 4)
+
+
 def test_only_what_has_changed_of_a_large_array_is_written(tmp_path, monkeypatch):
     monkeypatch.setattr(encoding, "BLOCK_BYTES", 2**16)
     written = []

@@ -105,6 +105,10 @@ def _not_written(error: OSError, path: Path) -> OSError:
     return OSError(error.errno or errno.EIO, f"{error.strerror or error}, so that this was not written", str(path))
 
 
+# Of file systems that cannot flush a folder, and write its names by themselves
+NO_FOLDER_SYNC = (errno.EBADF, errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
+
+
 def sync_folder(folder: Path) -> None:
     """
     Write the names of a folder's files to the disk.
@@ -117,6 +121,7 @@ def sync_folder(folder: Path) -> None:
         try:
             os.fsync(descriptor)
         except OSError as error:
-            raise OSError(error.errno, error.strerror, str(folder)) from error
+            if error.errno not in NO_FOLDER_SYNC:
+                raise OSError(error.errno, error.strerror, str(folder)) from error
         finally:
             os.close(descriptor)

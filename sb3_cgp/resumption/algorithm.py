@@ -12,9 +12,11 @@ from typing import Any, TypeVar
 import torch as th
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
+from stable_baselines3.common.utils import configure_logger
 
 from sb3_cgp.common.files import whole_file
 from sb3_cgp.common.load_arguments import check_load_arguments
@@ -190,10 +192,10 @@ class ResumableAlgorithm(ResumableModel):
             begin_new_episode(self, self.resumption)
         # SB3 resets the noise
         action_noise = copy.deepcopy(self.action_noise)
-        has_logger, folder = self._custom_logger, self.resumption["log_folder"]
-        if not has_logger and self.tensorboard_log is not None and folder is not None and os.path.isdir(folder):
+        has_logger = self._custom_logger
+        if not has_logger and self.tensorboard_log is not None:
             # SB3 would continue in the folder of the newest run
-            self.set_logger(continued_logger(folder, self.num_timesteps + 1, self.verbose))
+            self.set_logger(self._continued_logger(kwargs.get("tb_log_name", args[0] if args else "run")))
         steps_left = self._training_started_at + total_timesteps - self.num_timesteps
         result = super()._setup_learn(steps_left, callback, False, *args, **kwargs)
         self._custom_logger = has_logger
@@ -201,6 +203,14 @@ class ResumableAlgorithm(ResumableModel):
         if _number_of_noises(action_noise) == _number_of_noises(self.action_noise):
             self.action_noise = action_noise
         return result
+
+    def _continued_logger(self, name: str) -> Logger:
+        """Return a logger for TensorBoard in the training's folder; in a new one if that is gone, or another was given."""
+        assert self.resumption is not None
+        folder, is_same = self.resumption["log_folder"], self.resumption.get("tensorboard_log") == str(self.tensorboard_log)
+        if is_same and folder is not None and os.path.isdir(folder):
+            return continued_logger(folder, self.num_timesteps + 1, self.verbose)
+        return configure_logger(self.verbose, self.tensorboard_log, name, reset_num_timesteps=True)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         callback = super()._init_callback(callback, progress_bar)
@@ -215,8 +225,10 @@ class ResumableAlgorithm(ResumableModel):
             self._added_checkpoint = TrainingCheckpointCallback(**self.resumption["checkpoint"])
         if self._added_checkpoint is not None and not checkpoints:
             # Also in the offline training of a policy that follows, which saves a state at its end
+            self._added_checkpoint.init_callback(self)
             callback = CallbackList([callback, self._added_checkpoint])
-            callback.init_callback(self)
+            # Not initialised, as SB3 has initialised the first of them
+            callback.model = self
         self.callback = callback
         return callback
 

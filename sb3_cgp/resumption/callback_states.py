@@ -10,13 +10,16 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
 from sb3_cgp.resumption.fingerprints import fingerprint
-from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
+from sb3_cgp.resumption.plain_data import NotPlainError, from_plain, plain_attributes, set_plain_attributes, to_plain
 from sb3_cgp.resumption.replay_buffers import constructor_arguments
 
 State = dict[str, Any]
 Fingerprints = dict[str, bytes | None]
 # The attributes of every callback of SB3, which follow from the training
 COMMON = {"n_calls", "num_timesteps", "verbose", "locals", "globals", "parent"}
+
+# Of a callback that was called before the training, in place of an attribute's name
+EARLIER = ""
 
 
 def iter_callbacks(callback: BaseCallback) -> list[BaseCallback]:
@@ -42,7 +45,7 @@ def initial_attributes(callback: BaseCallback) -> dict[int, Fingerprints]:
     :param callback: the training's callback
     :return: fingerprints of the attributes by name, for each callback by its ``id``
     """
-    return {id(each): _fingerprints(each) for each in iter_callbacks(callback)}
+    return {id(each): _fingerprints(each) | _earlier(each) for each in iter_callbacks(callback)}
 
 
 def callback_states(callback: BaseCallback, training_env: VecEnv, initial: Mapping[int, Fingerprints]) -> list[State]:
@@ -51,7 +54,8 @@ def callback_states(callback: BaseCallback, training_env: VecEnv, initial: Mappi
 
     A callback has counted if an attribute differs from that time: one of the constructor's arguments, too, or one that is not
     plain data (:func:`~sb3_cgp.resumption.fingerprints.fingerprint`). One that declares its state has counted if this has
-    more than the counters of every callback.
+    more than the counters of every callback. Attributes that have not changed are not saved, as the constructor of the
+    resumed training's callback may have set them by other arguments.
 
     :param callback: the training's callback
     :param training_env: the training's environment, which is not saved with a callback
@@ -84,7 +88,7 @@ def restore_callbacks(callback: BaseCallback, states: list[State]) -> None:
 
     :param callback: the callback of the resumed training
     :param states: the states that :func:`callback_states` returned
-    :raises ValueError: if an evaluation environment is not the one whose state was saved
+    :raises ValueError: if the plain data of a state represents an unknown type
     """
     present: dict[tuple[str, int], BaseCallback] = {}
     seen: Counter[str] = Counter()
@@ -106,7 +110,7 @@ def restore_callbacks(callback: BaseCallback, states: list[State]) -> None:
 
 def _restore_callback(callback: BaseCallback, state: State) -> None:
     if "own" in state:
-        callback.set_training_state(state["own"])  # type: ignore[attr-defined]
+        callback.set_training_state(from_plain(state["own"]))  # type: ignore[attr-defined]
     else:
         set_plain_attributes(callback, state["attributes"])
     for attribute, environment in state["environments"].items():
@@ -114,7 +118,11 @@ def _restore_callback(callback: BaseCallback, state: State) -> None:
             message = f"The state of {state['class']}'s `{attribute}` was not saved: its episodes will be other ones."
             warnings.warn(message, stacklevel=2)
         elif isinstance(getattr(callback, attribute, None), VecEnv):
-            restore_environment(getattr(callback, attribute), environment)
+            try:
+                restore_environment(getattr(callback, attribute), environment)
+            except ValueError as error:
+                message = f"{state['class']}'s `{attribute}` is not the saved one, and its episodes will differ: {error}"
+                warnings.warn(message, stacklevel=2)
 
 
 def _callback_state(callback: BaseCallback, training_env: VecEnv, initial: Fingerprints) -> State:
@@ -123,9 +131,25 @@ def _callback_state(callback: BaseCallback, training_env: VecEnv, initial: Finge
     if hasattr(callback, "get_training_state"):
         own = callback.get_training_state()
         counted = own.keys() - COMMON if isinstance(own, dict) else own is not None
-        return state | {"own": own, "has_counted": bool(counted)}
-    attributes = plain_attributes(callback, without=_unsaved(callback))
-    return state | {"attributes": attributes, "has_counted": _fingerprints(callback) != initial}
+        return state | {"own": _as_plain(state["class"], own), "has_counted": bool(counted)}
+    before = {name: value for name, value in initial.items() if name != EARLIER}
+    now = _fingerprints(callback)
+    unchanged = {name for name, value in now.items() if value is not None and value == before.get(name)}
+    # One that has counted in an earlier training has further values from there
+    unsaved = _unsaved(callback) | (set() if EARLIER in initial else unchanged)
+    return state | {"attributes": plain_attributes(callback, without=unsaved), "has_counted": now != before}
+
+
+def _as_plain(name: str, own: Any) -> Any:
+    try:
+        return to_plain(own)
+    except NotPlainError as error:
+        raise ValueError(f"{name}.get_training_state() returned {own!r}, but must return plain data: {error}") from error
+
+
+def _earlier(callback: BaseCallback) -> Fingerprints:
+    """Return an entry that tells of a callback that it has been called before the training."""
+    return {EARLIER: None} if callback.n_calls > 0 else {}
 
 
 def _fingerprints(callback: BaseCallback) -> Fingerprints:

@@ -52,8 +52,13 @@ class Encoder:
             return {"tensor": str(plain.dtype), "shape": list(plain.shape), **self._refer(_bytes_of_tensor(plain))}
         if isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in ARRAY_KINDS:
             kind = "array" if isinstance(value, np.ndarray) else "scalar"
+            # The order in memory, from the outermost axis to the innermost, in which NumPy adds numbers
+            axes = [] if value.flags.c_contiguous else sorted(range(value.ndim), key=lambda axis: -abs(value.strides[axis]))
+            value = np.transpose(value, axes) if axes else value
             array = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
-            return {kind: value.dtype.newbyteorder("<").str, "shape": list(value.shape), **self._refer(_bytes_of(array))}
+            order = {"axes": axes} if axes else {}
+            shape = list(value.shape)
+            return {kind: value.dtype.newbyteorder("<").str, "shape": shape, **order, **self._refer(_bytes_of(array))}
         raise TypeError(f"{place} is a {type(value).__name__}, which a training state cannot hold.")
 
     def _encode_key(self, key: Any, place: str) -> Any:
@@ -114,6 +119,8 @@ class Decoder:
             return flat.reshape(value["shape"])
         dtype = np.dtype(value.get("array") or value["scalar"])
         array = np.frombuffer(content, dtype).reshape(value["shape"])
+        if "axes" in value:
+            array = array.transpose(np.argsort(value["axes"]))
         return array if "array" in value else array[()]
 
     def _read(self, reference: dict[str, Any]) -> bytearray:

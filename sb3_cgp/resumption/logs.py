@@ -39,6 +39,17 @@ def cut_monitors(path: Path, n_episodes: int | None, n_steps: int) -> None:
     os.truncate(path, sum(map(len, [*lines[:2], *rows[:n_episodes]])))
 
 
+def tensorboard_folder(logger: Logger) -> str | None:
+    """
+    Return the folder of TensorBoard's events.
+
+    :param logger: the training's logger
+    :return: the absolute path; None if the logger writes no events
+    """
+    writes_events = any(isinstance(each, TensorBoardOutputFormat) for each in logger.output_formats)
+    return os.path.abspath(logger.dir) if writes_events and logger.dir is not None else None
+
+
 def continued_logger(folder: str, first_step: int, verbose: int) -> Logger:
     """
     Create the logger that SB3 creates for TensorBoard, in a folder that already has events.

@@ -6,7 +6,6 @@ A state is a tree of plain data, arrays and tensors (:mod:`sb3_cgp.resumption.en
 """
 
 import io
-import os
 import random
 import warnings
 from typing import Any
@@ -20,6 +19,7 @@ from sb3_cgp.common.episodes import end_last_episode
 from sb3_cgp.common.rules import require
 from sb3_cgp.resumption.callback_states import callback_obstacles, callback_states, restore_callbacks
 from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
+from sb3_cgp.resumption.logs import tensorboard_folder
 from sb3_cgp.resumption.model import ResumableModel, State
 from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
 from sb3_cgp.resumption.replay_buffers import replay_buffer_state
@@ -54,7 +54,8 @@ def gather(model: ResumableModel, callback: BaseCallback) -> State:
         "statistics": None if normalizer is None else plain_attributes(normalizer, set(vars(normalizer)) - set(STATISTICS)),
         "callbacks": callback_states(callback, model.env, model._initial_callbacks),
         "logger": _pending(model.logger),
-        "log_folder": None if model.logger.dir is None else os.path.abspath(model.logger.dir),
+        "log_folder": tensorboard_folder(model.logger),
+        "tensorboard_log": None if model.tensorboard_log is None else str(model.tensorboard_log),
         "random": _random_state(model),
     }
 

@@ -197,7 +197,8 @@ def is_finished(folder: Path, args: argparse.Namespace, hyperparams: dict[str, A
         return False
     data, _, _ = load_from_zip_file(model, device="cpu")
     assert data is not None
-    n_done = max(steps, default=data["num_timesteps"])
+    # The model is that of an earlier interruption where the process was killed before it saved the last one
+    n_done = min(data["num_timesteps"], max(steps, default=data["num_timesteps"]))
     is_complete = bool(n_done >= n_timesteps and not data["_policy_is_due"])
     if not steps and not is_complete:
         raise FileNotFoundError(
