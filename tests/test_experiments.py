@@ -322,3 +322,13 @@ def test_a_file_that_is_no_mapping(tmp_path):
     (tmp_path / "mine.yml").write_text("a: [")
     with pytest.raises(SweepError, match="cannot be read"):
         load_sweep(str(tmp_path / "mine.yml"))
+
+
+def test_a_file_with_the_name_of_one_of_the_projects_sweeps_is_warned_of(tmp_path, capsys):
+    for name, warns in (("mine", False), ("e1", True), ("e12-lr", True)):
+        path = tmp_path / f"{name}.yml"
+        path.write_text((sweeps_folder() / "e1.yml").read_text())
+        load_sweep(str(path))
+        assert ("count as data on the paper's claims" in capsys.readouterr().err) == warns
+    load_sweep("e1")
+    assert "claims" not in capsys.readouterr().err

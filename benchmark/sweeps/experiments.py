@@ -147,11 +147,7 @@ def find_sweep_file(name: str) -> Path:
     problem = problem_of(name)
     if problem is not None:
         raise SweepError(name, "", problem)
-    path = sweep_path(name)
-    if OWN_NAMES.fullmatch(path.stem) and path.resolve().parent != sweeps_folder():
-        # The page would take it for one of these, and its runs for data on the paper's claims
-        raise SweepError(path, "", "must have another name: e1, e2 and so on are this project's sweeps")
-    return path
+    return sweep_path(name)
 
 
 def experiments_in_words() -> str:
@@ -194,6 +190,9 @@ def load_sweep(name: str, overrides: dict[str, Any] | None = None, methods: Sequ
     :raises SweepError: if the file or an override is wrong; it names the place, the key and what is allowed
     """
     path = find_sweep_file(name)
+    if OWN_NAMES.fullmatch(path.stem) and path.resolve().parent != sweeps_folder():
+        consequence = "its runs count as data on the paper's claims. Rename the file if they are not"
+        print(f"Warning: {path} has the name of one of this project's sweeps: {consequence}.", file=sys.stderr)
     content = read_yaml(path)
     overrides = {key: value for key, value in (overrides or {}).items() if value is not None}
     packages = validated(Packages, {"gym_packages": overrides.pop("gym_packages", [])}, "the command line").gym_packages
