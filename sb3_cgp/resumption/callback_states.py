@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
 from sb3_cgp.resumption.fingerprints import fingerprint
-from sb3_cgp.resumption.plain_data import NotPlainError, from_plain, plain_attributes, set_plain_attributes, to_plain
+from sb3_cgp.resumption.plain_data import declared_state, from_plain, plain_attributes, set_plain_attributes
 from sb3_cgp.resumption.replay_buffers import constructor_arguments
 
 State = dict[str, Any]
@@ -131,20 +131,14 @@ def _callback_state(callback: BaseCallback, training_env: VecEnv, initial: Finge
     if hasattr(callback, "get_training_state"):
         own = callback.get_training_state()
         counted = own.keys() - COMMON if isinstance(own, dict) else own is not None
-        return state | {"own": _as_plain(state["class"], own), "has_counted": bool(counted)}
+        plain = declared_state(f"{state['class']}.get_training_state()", own)
+        return state | {"own": plain, "has_counted": bool(counted)}
     before = {name: value for name, value in initial.items() if name != EARLIER}
     now = _fingerprints(callback)
     unchanged = {name for name, value in now.items() if value is not None and value == before.get(name)}
     # One that has counted in an earlier training has further values from there
     unsaved = _unsaved(callback) | (set() if EARLIER in initial else unchanged)
     return state | {"attributes": plain_attributes(callback, without=unsaved), "has_counted": now != before}
-
-
-def _as_plain(name: str, own: Any) -> Any:
-    try:
-        return to_plain(own)
-    except NotPlainError as error:
-        raise ValueError(f"{name}.get_training_state() returned {own!r}, but must return plain data: {error}") from error
 
 
 def _earlier(callback: BaseCallback) -> Fingerprints:

@@ -22,7 +22,7 @@ from sb3_cgp.resumption.mujoco_data import (
     set_model_state,
     set_mujoco_state,
 )
-from sb3_cgp.resumption.plain_data import NotPlainError, from_plain, plain_attributes, set_plain_attributes, to_plain
+from sb3_cgp.resumption.plain_data import declared_state, from_plain, plain_attributes, set_plain_attributes, to_plain
 
 RESTORABLE_MODULES = (
     "gymnasium.envs.classic_control.",
@@ -143,11 +143,7 @@ def _own_state(layer: Any, name: str, declaration: Declaration, problems: list[s
         problems.append(f"{described} returned None.")
     if declaration is OWN and not hasattr(type(layer), "set_training_state"):
         problems.append(f"{name} has a get_training_state() and no set_training_state(): it needs {METHODS}.")
-    try:
-        return to_plain(own)
-    except NotPlainError as error:
-        message = f"{described} returned {own!r}, but must return plain data: {error}"
-        raise ValueError(message) from error
+    return declared_state(described, own)
 
 
 def _problems(layer: Any, name: str, saved: Any, is_declared: bool) -> list[str]:

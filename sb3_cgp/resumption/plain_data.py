@@ -103,6 +103,21 @@ def to_plain(value: Any) -> Any:
     raise NotPlainError(f"A {kind.__module__}.{kind.__qualname__} is not plain data.")
 
 
+def declared_state(described: str, own: Any) -> Any:
+    """
+    Copy the state that an object declares, by a method such as ``get_training_state``, as plain data.
+
+    :param described: the method, for the error
+    :param own: what it returned
+    :return: the plain data
+    :raises ValueError: if it is anything else, naming the method and what it returned
+    """
+    try:
+        return to_plain(own)
+    except NotPlainError as error:
+        raise ValueError(f"{described} returned {own!r}, but must return plain data: {error}") from error
+
+
 def from_plain(plain: Any, current: Any = None) -> Any:
     """
     Convert plain data back to the value that :func:`to_plain` copied.
