@@ -154,10 +154,9 @@ class CudaGraphAlgorithm(CGP):
         selector = self.policy.selector
         noise = (self.target_policy_noise, self.target_noise_clip)
         policy = (getattr(self.policy, "cem_dtype", None), getattr(self.policy, "actor_proposes", None))
-        trained = tuple(parameter.requires_grad for parameter in self.policy.parameters())
         # What a graph fixes when it is recorded, and a callback may change
-        step = (self.gamma, self.tau, self.batch_size, *noise, self.policy_loss, self._optimizer_options())
-        settings = (*step, trained, *policy, selector, repr(selector))
+        step = (self.gamma, self.tau, self.batch_size, *noise, self.policy_loss, *self._optimizer_settings())
+        settings = (*step, *policy, selector, repr(selector))
         if settings != self._recorded_settings:
             self._recorded.clear()
             self._recorded_settings = settings
@@ -166,10 +165,14 @@ class CudaGraphAlgorithm(CGP):
             self._recorded[due] = RecordedFunction() if due is None else RecordedFunction(self._list_state)
         return self._recorded[due]
 
-    def _optimizer_options(self) -> str:
-        """Return the options of the optimizers but the learning rates, which are tensors that a graph reads."""
+    def _optimizer_settings(self) -> tuple[str, list[bool]]:
+        """
+        Return the options of the optimizers but the learning rates, which are tensors that a graph reads, and which of their
+        parameters are trained. Their lists are read at every step, as walking through the networks takes ten times as long.
+        """
         groups = [*self.actor.optimizer.param_groups, *self.critic.optimizer.param_groups]
-        return str([{key: value for key, value in group.items() if key not in ("params", "lr")} for group in groups])
+        options = str([{key: value for key, value in group.items() if key not in ("params", "lr")} for group in groups])
+        return options, [parameter.requires_grad for group in groups for parameter in group["params"]]
 
     def _list_state(self) -> list[th.Tensor]:
         """Return the tensors that a gradient step changes in place."""
