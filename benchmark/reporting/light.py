@@ -48,7 +48,7 @@ class Comparison:
     @property
     def shows_no_loss(self) -> bool:
         """Whether the interval contains no loss that counts."""
-        return self.word != TOO_FEW and self.largest_loss is not None and self.largest_loss <= MARGIN
+        return self.largest_loss is not None and self.largest_loss <= MARGIN
 
     @property
     def largest_loss(self) -> float | None:
@@ -125,7 +125,8 @@ def answer(compared: Sequence[Comparison], missing: Sequence[str]) -> str:
         sentences = [f"**Yes, on {'; '.join(losses)}.**"]
     elif decided:
         higher = sum(each.word == HIGHER for each in decided)
-        answer_word = "No" if sum(each.shows_no_loss for each in decided) == total else "Not decided"
+        is_no = len(decided) == total and all(each.shows_no_loss for each in decided)
+        answer_word = "No" if is_no else "Not decided"
         counted = f"higher on {higher}, lower on none, and not distinguishable on {len(decided) - higher}"
         sentences = [f"**{answer_word}: of {total} tasks, {LIGHT} is {counted}.**"]
     else:

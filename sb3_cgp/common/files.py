@@ -10,6 +10,8 @@ from typing import BinaryIO
 
 # The prefix of the names of files that are not complete yet
 PARTIAL = ".partial-"
+# Errors of file systems that cannot flush a folder, and write its names by themselves
+NO_FOLDER_SYNC = (errno.EBADF, errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 
 
 @contextmanager
@@ -103,10 +105,6 @@ def _remove(path: Path) -> None:
 
 def _not_written(error: OSError, path: Path) -> OSError:
     return OSError(error.errno or errno.EIO, f"{error.strerror or error}, so that this was not written", str(path))
-
-
-# Of file systems that cannot flush a folder, and write its names by themselves
-NO_FOLDER_SYNC = (errno.EBADF, errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 
 
 def sync_folder(folder: Path) -> None:
