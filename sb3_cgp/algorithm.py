@@ -46,8 +46,8 @@ class CGP(
     """
     Cross-Entropy Guided Policies (CGP).
 
-    Learns Q-functions by TD3's objective, with actions picked by the Cross-Entropy Method (CEM), and distils CEM into
-    an actor that acts at inference for the price of one forward pass.
+    Learn Q-functions by TD3's objective, with actions that the Cross-Entropy Method (CEM) selects, and train an actor to
+    imitate CEM. After training, an action costs one forward pass of the actor.
 
     Paper: https://arxiv.org/abs/1903.10605 (Algorithms 1 and 2; the defaults are Appendix B's)
 
@@ -83,9 +83,9 @@ class CGP(
     :param cem_actor_fraction: with ``cem_start="actor"``, the share of ``cem_samples`` drawn around the actor's action.
         The rest, but for the actor's action itself, is drawn from the prior.
     :param cem_actor_std: standard deviation of the samples around the actor's action, before tanh
-    :param cem_dtype: data type of all layers of the critic but the last one while CEM evaluates it: "float32", "bfloat16", or
-        "auto", which is bfloat16 on processors that multiply it faster than float32. Values, actions and the critic's own
-        training are float32 in any case.
+    :param cem_dtype: data type of all layers of the critic but the last one while CEM evaluates it: "auto" (the default),
+        which is bfloat16 on processors that multiply it faster than float32, "float32" or "bfloat16". Values, actions and the
+        critic's own training are float32 in any case.
     :param cuda_graphs: on a GPU, whether gradient steps and CEM's acting are recorded as CUDA graphs, and the replay buffer
         is kept on the GPU: the same computation in less time. A graph fixes the Python decisions of a user's own selector.
         Has no effect on a CPU or with other observations than ``Box``. With another optimizer than the fused Adam, the

@@ -74,6 +74,7 @@ class CEM:
         Maximise ``score`` for each state by Algorithm 1, with random numbers of PyTorch's global generator.
 
         The parameters are those of :class:`ActionSelector`. A NaN score ranks last, where `topk` would rank it first.
+
         :return: the selected actions (B, A) and the last elites (B, K, A)
         """
         shape = (n_states, self.samples, action_dim)

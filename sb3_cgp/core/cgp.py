@@ -30,11 +30,10 @@ SelfCGP = TypeVar("SelfCGP", bound="CGP")
 class CGP(OffPolicyAlgorithm):
     """
     Cross-Entropy Guided Policies (CGP), the paper's algorithm: the base of :class:`sb3_cgp.CGP`.
-    Learns Q-functions by TD3's objective, with actions picked by the Cross-Entropy Method (CEM), and distils CEM into
-    an actor that acts at inference for the price of one forward pass.
 
-    Paper: https://arxiv.org/abs/1903.10605 (Algorithms 1 and 2; the defaults are Appendix B's)
-    The arguments that are not listed are those of SB3's ``OffPolicyAlgorithm``.
+    Learn Q-functions by TD3's objective, with actions of the Cross-Entropy Method (CEM), and an actor that imitates CEM.
+
+    Paper: https://arxiv.org/abs/1903.10605 (Algorithms 1 and 2). Arguments not listed are those of ``OffPolicyAlgorithm``.
 
     :param learning_rate: learning rate of the critics: a number, a function of the progress remaining (from 1 to 0), or a
         string such as ``"lin_1e-3"`` for a linear schedule that ends at 0

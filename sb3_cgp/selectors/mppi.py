@@ -1,5 +1,5 @@
 """
-Model Predictive Path Integral control (MPPI) for one step: elites count by their values.
+Model Predictive Path Integral control (MPPI) with a horizon of one step: elites are weighted by the softmax of their values.
 
 Shapes: B states, P proposals, N samples and K elites per state, A action dimensions.
 """

@@ -46,7 +46,7 @@ class ProposalSelector(ActionSelector, Protocol):
 class ActorStart:
     """
     The rule by which the first samples start from proposals: the proposals themselves, a share around them, and the rest
-    from the prior, whose samples make the selector independent of a bad actor.
+    from the prior, whose samples let the search leave a bad actor's action.
 
     :param fraction: share of the samples that is drawn around the proposals, from 0 to 1; none are left for the prior at 1
     :param std: standard deviation of these samples, before tanh
