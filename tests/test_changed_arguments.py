@@ -98,11 +98,25 @@ def test_a_selector_of_the_users_stays_and_a_warning_says_so():
     assert model.policy.selector == MPPI()
     with pytest.warns(UserWarning, match="cem_iterations=7, cem_samples=200 has no effect"):
         make_model(MPPI(), cem_samples=200, cem_iterations=7)
-    # One that was set on the policy, too
+    # One that was set on the policy, and one whose attributes were changed, too
+    for selector in (MPPI(), CEM(samples=128)):
+        model = make_model()
+        model.policy.selector = selector
+        with pytest.warns(UserWarning, match=r"cem_samples=8 has no effect, as the selector \w+\(.* replaces CEM"):
+            model.cem_samples = 8
+        assert model.policy.selector == selector
+
+
+def test_a_choice_on_the_policy_stays_when_other_arguments_change():
     model = make_model()
-    model.policy.selector = MPPI()
-    model.cem_samples = 8
-    assert model.policy.selector == MPPI()
+    model.policy.inference, model.policy.cem_dtype = "cem", "float32"
+    with model.policy.acting_by("averaged_actor"):
+        model.cem_samples = 32
+        assert model.policy.inference == "averaged_actor"
+    model.policy_delay, model.target_policy_noise = 2, 0.1
+    assert (model.policy.inference, model.policy.cem_dtype) == ("cem", "float32")
+    model.inference = "actor"
+    assert model.policy.inference == "actor"
 
 
 @pytest.mark.parametrize(

@@ -64,6 +64,26 @@ class TestOffline:
         # It stopped the policy's training too, at once
         assert model.policy.inference == "cem"
 
+    @pytest.mark.parametrize("policy_loss", [None, "cgp"])
+    @pytest.mark.parametrize("steps", [10, 60], ids=["random steps", "gradient steps"])
+    def test_one_that_is_due_is_left_out_where_the_training_goes_on_otherwise(self, steps, policy_loss):
+        model = make_model(policy_training="offline").learn(100, callback=self.Watcher(107))
+        model.policy_training = "online"
+        model.policy_loss = policy_loss
+        watcher = self.Watcher()
+        model.learn(steps, callback=watcher)
+        assert watcher.n_calls == steps
+        assert model.policy.inference == ("actor" if steps == 60 and policy_loss == "cgp" else "cem")
+
+    def test_an_actor_is_out_of_date_when_the_critics_have_learnt_without_it(self):
+        model = make_model(policy_training="offline").learn(100)
+        assert model.policy.inference == "actor"
+        model.policy_training = "online"
+        model.policy_loss = None
+        model.learn(60)
+        model.policy_loss = "cgp"
+        assert model.policy.inference == "cem"
+
     def test_a_callback_can_stop_it(self):
         for stop_after, inference in ((107, "cem"), (117, "actor")):
             watcher = self.Watcher(stop_after)

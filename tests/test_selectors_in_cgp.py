@@ -47,6 +47,8 @@ def make_model(policy="MlpPolicy", **kwargs):
         (lambda: make_model(cem_start="actor", cem_actor_fraction=-0.1), "cem_actor_fraction"),
         (lambda: make_model(cem_start="actor", cem_actor_std=math.inf), "cem_actor_std"),
         (lambda: make_model(cem_start="actor", policy_loss=None), "cem_start"),
+        (lambda: make_model(policy_loss=None, policy_kwargs=dict(selector=ActorCEM())), "selector"),
+        (lambda: make_model(policy_loss=None, policy_kwargs=dict(selector=MPPI(1, 16, start=ActorStart()))), "selector"),
         (lambda: make_model(cem_start="actor", policy_kwargs=dict(selector=CEM())), "cem_start"),
         (lambda: make_model(cem_start="actor", policy=WithSelector), "cem_start"),
         (lambda: make_model(cem_start="actor", cem_samples=1, cem_elites=1), "cem_samples"),
@@ -252,6 +254,65 @@ def test_other_selectors_of_a_model_that_is_loaded_are_set_on_its_policy(tmp_pat
     make_model(policy_kwargs=dict(net_arch=[16], selector=Fixed(0.2)), cem_samples=64, cem_elites=6).save(tmp_path / "model")
     with pytest.raises(ValueError, match=r"Leave `policy_kwargs` out.*`model\.policy\.selector = "):
         CGP.load(tmp_path / "model", policy_kwargs=dict(net_arch=[16], selector=Fixed(0.2)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "selector"),
+    [
+        (LIGHT, MPPI()),
+        (LIGHT, ActorCEM(2, 32)),
+        (dict(policy_kwargs=dict(net_arch=[16], selector=MPPI())), CEM()),
+        (dict(policy=WithSelector), CEM()),
+        (dict(policy=WithSelector), MPPI()),
+        (dict(policy_loss="qgp"), ActorOnly()),
+    ],
+    ids=lambda value: None if isinstance(value, dict) else repr(value),
+)
+def test_whatever_selector_is_set_is_saved_and_the_model_remains_as_it_is(arguments, selector, tmp_path):
+    model = make_model(**arguments)
+    policy_kwargs = dict(model.policy_kwargs)
+    for each in (MPPI(3), selector):
+        model.policy.selector = each
+        model.save(tmp_path / "model")
+    assert model.policy_kwargs == policy_kwargs
+    # An argument of no selector
+    model.target_policy_noise = 0.1
+    loaded = CGP.load(tmp_path / "model", env=model.get_env())
+    assert type(loaded.policy.selector) is type(selector)
+    assert loaded.learn(60).policy.selector == selector
+
+
+@pytest.mark.parametrize("arguments", [{}, LIGHT])
+def test_a_selector_that_is_changed_in_place_is_saved(arguments, tmp_path):
+    model = make_model(**arguments)
+    model.policy.selector.samples = 32
+    model.save(tmp_path / "model")
+    assert CGP.load(tmp_path / "model").policy.selector == model.policy.selector
+    assert CGP.load(tmp_path / "model").policy.selector.samples == 32
+
+
+@pytest.mark.parametrize(
+    ("selector", "name"),
+    [(ActorOnly(), "policy_loss"), (ActorCEM(2, 8, actor_fraction=1.0, actor_std=0.0), "selector"), (MPPI, "selector")],
+)
+def test_a_selector_that_is_set_on_the_policy_is_checked_when_a_training_begins(selector, name):
+    model = make_model()
+    model.policy.selector = selector
+    with pytest.raises(ValueError, match=f"`{name}` is .*, but must be"):
+        model.learn(60)
+    model.policy.selector = CEM()
+    assert model.learn(60).num_timesteps == 60
+
+
+def test_the_actor_alone_acts_whatever_the_delay_of_its_training_was(tmp_path):
+    """... as in TD3: an actor that was not trained yet is all that there is."""
+    model = make_model(policy_loss="qgp", policy_delay=1_000, policy_kwargs=dict(net_arch=[16], selector=ActorOnly()))
+    model.learn(60)
+    model.policy_delay = 2
+    model.save(tmp_path / "model")
+    assert model.learn(60, reset_num_timesteps=False).num_timesteps == 120
+    loaded, observations = CGP.load(tmp_path / "model"), th.rand(4, 3)
+    assert th.equal(loaded.policy.select_actions(observations, loaded.critic).actions, loaded.actor(observations))
 
 
 def test_saving_leaves_the_arguments_of_cem_as_they_are(tmp_path):

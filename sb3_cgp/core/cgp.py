@@ -180,8 +180,7 @@ class CGP(OffPolicyAlgorithm):
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
         self._update_learning_rates(self._current_progress_remaining, "critic", "actor")
-        if self.policy_training == "offline":
-            self._mark_policy(is_trained=False, is_due=True)
+        self._mark_policy(self._policy_is_trained and self._trains_online, is_due=self.policy_training == "offline")
 
         values = defaultdict(list)
         for _ in range(gradient_steps):
@@ -257,7 +256,8 @@ class CGP(OffPolicyAlgorithm):
         """Learn as SB3's algorithms do, and train the policy at the end if its training is offline (:meth:`train_policy`)."""
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         # Only if the critics have changed. A loaded model has no buffer if a callback stopped `learn` at its first step.
-        if self._policy_is_due and self.replay_buffer is not None and self.replay_buffer.size() > 0:
+        is_due = self._policy_is_due and self.policy_training == "offline"
+        if is_due and self.replay_buffer is not None and self.replay_buffer.size() > 0:
             self.train_policy(callback=callback, progress_bar=progress_bar)
         return self
 
@@ -287,7 +287,7 @@ class CGP(OffPolicyAlgorithm):
             # No `learn` has configured it, as in a loaded model
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "CGP", reset_num_timesteps=False)
 
-        plateau, losses, was_trained = offline.Plateau(), [], self._policy_is_trained
+        plateau, losses, is_trained = offline.Plateau(), [], self._policy_is_trained
         # Callbacks evaluate and save the actor that is being trained
         self._mark_policy(is_trained=True, is_due=self._policy_is_due)
         try:
@@ -318,13 +318,13 @@ class CGP(OffPolicyAlgorithm):
             else:
                 warnings.warn(f"The policy's loss has not reached a plateau in max_steps={max_steps} steps.", stacklevel=2)
             # An actor that a callback stopped within its first round is of no use
-            was_trained = was_trained or n_steps >= min(offline.ROUND, max_steps)
+            is_trained = is_trained or n_steps >= min(offline.ROUND, max_steps)
             if is_stopped:
-                acts = "the actor" if was_trained else "CEM"
+                acts = "the actor" if is_trained else "CEM"
                 warnings.warn(f"A callback stopped the policy's training after {n_steps} steps: {acts} acts.", stacklevel=2)
             self._policy_is_due = is_stopped
         finally:
-            self._mark_policy(was_trained, self._policy_is_due)
+            self._mark_policy(is_trained, self._policy_is_due)
         callback.on_training_end()
         if self.verbose >= 1:
             print(f"The policy was trained for {n_steps} gradient steps")

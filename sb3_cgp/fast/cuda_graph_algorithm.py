@@ -115,8 +115,7 @@ class CudaGraphAlgorithm(CGP):
         self.policy.set_training_mode(True)
         self._update_learning_rates(self._current_progress_remaining, "critic", "actor")
         # This mark, and that below, are the core's `train`'s, which no replay sets
-        if self.policy_training == "offline":
-            self._mark_policy(is_trained=False, is_due=True)
+        self._mark_policy(self._policy_is_trained and self._trains_online, is_due=self.policy_training == "offline")
         losses, n_updates_before = defaultdict(list), self._n_updates
         for _ in range(gradient_steps):
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)

@@ -3,6 +3,8 @@
 import warnings
 from typing import Any, ClassVar
 
+from stable_baselines3.common.callbacks import BaseCallback
+
 from sb3_cgp.common.rules import require, require_choice
 from sb3_cgp.core.cem import CEM, ActionSelector
 from sb3_cgp.core.cgp import CGP
@@ -12,6 +14,16 @@ from sb3_cgp.selectors.policies import CGPPolicy
 from sb3_cgp.selectors.proposals import ActorStart, check_start, takes_proposals
 
 STARTS = ("prior", "actor")
+# The arguments of which the selector is made
+CEM_ARGUMENTS = (
+    "cem_iterations",
+    "cem_samples",
+    "cem_elites",
+    "cem_result",
+    "cem_start",
+    "cem_actor_fraction",
+    "cem_actor_std",
+)
 
 
 class SelectorAlgorithm(CGP):
@@ -23,7 +35,8 @@ class SelectorAlgorithm(CGP):
     training itself starts from the actor that it trains.
 
     The ``changeable_arguments`` may be changed on the model, also by a callback: they are checked, and take effect at once.
-    So does another selector that is set on the policy, which is then saved with the model.
+    So does another selector that is set on the policy, in the place of the arguments of CEM. It is saved with the model, and
+    checked at the next ``learn``.
     """
 
     # The arguments of the constructor
@@ -33,7 +46,7 @@ class SelectorAlgorithm(CGP):
 
     # The arguments that are checked and followed when they are changed on a model
     changeable_arguments: ClassVar[tuple[str, ...]] = (
-        *("cem_iterations", "cem_samples", "cem_elites", "cem_result", "cem_start", "cem_actor_fraction", "cem_actor_std"),
+        *CEM_ARGUMENTS,
         *("policy_loss", "policy_training", "policy_delay", "inference"),
         *("target_update_interval", "target_policy_noise", "target_noise_clip"),
     )
@@ -42,8 +55,25 @@ class SelectorAlgorithm(CGP):
         given = self.policy_kwargs.get("actor_proposes")
         require(given is None, "policy_kwargs['actor_proposes']", given, "left out: CGP sets it when the actor is trained")
         super()._setup_model()
+        if "_saved_selector" in vars(self):
+            saved = self._saved_selector
+            self.policy.selector = self._make_selector() if saved is None else saved
+        elif self.cem_start == "actor":
+            allowed = "'prior' with a selector of `policy_kwargs` or of the policy's class, which replaces CEM"
+            require(self._selector_is_made_here, "cem_start", self.cem_start, allowed)
         self._check_selector()
-        self._initial_selector = self.policy.selector
+        self._warn_if_replaced(*(name for name, default in _defaults().items() if getattr(self, name) != default))
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        # One may have been set on the policy
+        self._check_selector()
+        return super()._setup_learn(*args, **kwargs)
+
+    @property
+    def _selector_is_made_here(self) -> bool:
+        """Whether the selector is that of the arguments, and not one that replaces it."""
+        selector, made = self.policy.selector, self._make_selector()
+        return type(selector) is type(made) and selector == made
 
     def save(self, *args: Any, **kwargs: Any) -> None:
         """
@@ -52,13 +82,8 @@ class SelectorAlgorithm(CGP):
         :param args: the arguments of SB3's method
         :param kwargs: the same arguments by keyword
         """
-        selector = self.policy.selector
-        if selector is not self._initial_selector and selector != self._make_selector():
-            self.policy_kwargs, self._initial_selector = self.policy_kwargs | {"selector": selector}, selector
+        self._saved_selector = None if self._selector_is_made_here else self.policy.selector
         super().save(*args, **kwargs)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_initial_selector"]
 
     def __setattr__(self, name: str, value: Any) -> None:
         """
@@ -71,8 +96,8 @@ class SelectorAlgorithm(CGP):
         if name not in self.changeable_arguments or "policy" not in vars(self):
             super().__setattr__(name, value)
             return
-        before, selector = getattr(self, name), self.policy.selector
-        is_made_here = self.policy_kwargs.get("selector") is None and selector == self._make_selector()
+        before, selector, had_actor = getattr(self, name), self.policy.selector, self._has_actor
+        is_made_here = self._selector_is_made_here
         super().__setattr__(name, value)
         try:
             self._check_arguments()
@@ -83,11 +108,11 @@ class SelectorAlgorithm(CGP):
             super().__setattr__(name, before)
             self.policy.selector = selector
             raise
-        self._follow_arguments()
-
-    def _follow_arguments(self) -> None:
-        """Set what the policy has of the arguments, besides the selector."""
-        self._choose_inference()
+        if not is_made_here and name in CEM_ARGUMENTS:
+            self._warn_if_replaced(name)
+        # Not with every argument: the user may have chosen otherwise on the policy
+        if name == "inference" or self._has_actor != had_actor:
+            self._choose_inference()
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
@@ -95,25 +120,24 @@ class SelectorAlgorithm(CGP):
         check_start(self.cem_actor_fraction, self.cem_actor_std, prefix="cem_actor_")
 
     def _check_selector(self) -> None:
-        """Check that the selector fits the policy and the arguments, and warn of arguments that it replaces."""
+        """Check that the selector fits the policy and the arguments."""
         selector = self.policy.selector
         is_selector = not isinstance(selector, type) and callable(getattr(selector, "select", None))
         require(is_selector, "selector", selector, "an instance with a method `select`, such as sb3_cgp.selectors.MPPI()")
         allowed = "a subclass of sb3_cgp.CGPPolicy, whose actor can propose actions to the selector"
         proposes = isinstance(self.policy, CGPPolicy)
         require(proposes or not takes_proposals(selector), "policy", self.policy_class, allowed)
-        if self.cem_start == "actor":
-            allowed = "'prior' where `policy_loss=None` trains no actor"
-            require(self.policy_loss is not None, "cem_start", self.cem_start, allowed)
-            is_ours = self.policy_kwargs.get("selector") is None and isinstance(selector, ActorCEM)
-            allowed = "'prior' with a selector of `policy_kwargs` or of the policy's class, which replaces CEM"
-            require(is_ours, "cem_start", self.cem_start, allowed)
+        if self.policy_loss is None:
+            require(self.cem_start == "prior", "cem_start", self.cem_start, "'prior' where `policy_loss=None` trains no actor")
+            starts = isinstance(getattr(selector, "start", None), ActorStart)
+            require(
+                not starts, "selector", selector, "one that starts from the prior where `policy_loss=None` trains no actor"
+            )
         self._check_imitation()
         if isinstance(selector, ActorOnly):
             reason = "with the selector ActorOnly(), whose actions are the actor's own"
             require(self.policy_loss == "qgp", "policy_loss", self.policy_loss, f"'qgp' {reason}")
             require(self._trains_online, "policy_training", self.policy_training, f"'online' {reason}")
-        self._warn_of_replaced_arguments()
 
     def _check_imitation(self) -> None:
         """Check that an actor which imitates the selector is shown other actions than its own."""
@@ -123,23 +147,19 @@ class SelectorAlgorithm(CGP):
             return
         is_useful = start.leaves_others(samples)
         reason = "policy_loss='cgp', as an actor that imitates itself learns nothing"
-        if self.cem_start == "actor":
+        if self._selector_is_made_here:
             require(samples > 1, "cem_samples", samples, f"at least 2 with cem_start='actor' and {reason}")
             allowed = f"greater than 0, or `cem_actor_fraction` smaller, with cem_start='actor' and {reason}"
             require(is_useful, "cem_actor_std", start.std, allowed)
         require(is_useful, "selector", selector, f"one with samples that differ from the actor's action with {reason}")
 
-    def _warn_of_replaced_arguments(self) -> None:
-        """Warn of arguments of CEM that have no effect, as a selector of the user's replaces CEM."""
-        if self.policy_kwargs.get("selector") is None:
-            return
-        defaults = vars(CEM())
-        values = {f"cem_{name}": getattr(self, f"cem_{name}") for name in defaults}
-        changed = [f"{name}={value!r}" for name, value in values.items() if value != defaults[name.removeprefix("cem_")]]
-        if changed:
+    def _warn_if_replaced(self, *names: str) -> None:
+        """Warn that arguments of CEM have no effect where another selector replaces CEM."""
+        if names and not self._selector_is_made_here:
+            arguments = ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
             warnings.warn(
-                f"{', '.join(changed)} has no effect, as the selector {self.policy.selector} replaces CEM: set the selector's "
-                "own arguments.",
+                f"{arguments} has no effect, as the selector {self.policy.selector} replaces CEM: set the selector's own "
+                "arguments.",
                 stacklevel=2,
             )
 
@@ -152,3 +172,8 @@ class SelectorAlgorithm(CGP):
     def _choose_inference(self) -> None:
         super()._choose_inference()
         self.policy.actor_proposes = self._has_actor  # type: ignore[assignment]
+
+
+def _defaults() -> dict[str, Any]:
+    """Return the default values of CEM's arguments, by their names as CGP's."""
+    return {f"cem_{name}": value for name, value in vars(CEM()).items()}

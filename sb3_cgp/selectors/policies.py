@@ -8,6 +8,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_cgp.common.networks import evaluation_mode
 from sb3_cgp.common.rules import require
 from sb3_cgp.core import policies
+from sb3_cgp.selectors.actor_only import ActorOnly
 from sb3_cgp.selectors.proposals import takes_proposals
 
 
@@ -39,7 +40,8 @@ class CGPPolicy(policies.CGPPolicy):
         """
         if not takes_proposals(self.selector):
             return {}
-        if not self.actor_proposes:
+        # ActorOnly has no other actions to begin with
+        if not self.actor_proposes and not isinstance(self.selector, ActorOnly):
             return {"proposals": None}
         actor = self.actor_target if critic is self.critic_target else self.actor
         with evaluation_mode(actor):
