@@ -83,8 +83,8 @@ class DiagnosticsAlgorithm(CGP):
 
     def _record_means(self, values: dict[str, list[th.Tensor]]) -> None:
         super()._record_means(values)
-        # Without the critics' loss, these are the losses of a round of offline policy training
-        if "critic_loss" not in values:
+        # The losses of a round of offline policy training
+        if values.keys() == {"actor_loss"}:
             self._log_diagnostics(self.batch_size, has_actor=True)
 
     def _log_diagnostics(self, batch_size: int, has_actor: bool) -> None:

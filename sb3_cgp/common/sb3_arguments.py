@@ -98,7 +98,7 @@ def replay_buffer_class_of(model: OffPolicyAlgorithm) -> type[ReplayBuffer]:
     """
     Return the class of a model's replay buffer: the given one, or that which SB3 chooses.
 
-    :param model: the model, before its replay buffer is made
+    :param model: the model, with the arguments of the constructor
     :return: the class
     """
     if model.replay_buffer_class is not None:

@@ -16,6 +16,7 @@ from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cgp.common.rules import require
+from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer, fits_device, leaves_room
 
 SB3_BUFFERS = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer)
@@ -64,7 +65,7 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         # SB3 allocates a buffer unless there is one, and asks for an environment to do so for hindsight replay
         self.replay_buffer = ReplayBuffer.__new__(ReplayBuffer)
         super()._setup_model()
-        self._buffer_class, self.replay_buffer = self.replay_buffer_class, None
+        self.replay_buffer = None
         self.replay_buffer_class, self.replay_buffer_kwargs = given
         if not self._defers_replay_buffer:
             self._ensure_replay_buffer()
@@ -77,15 +78,15 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
 
     def _choose_buffer_class(self) -> type[ReplayBuffer]:
         """Return the class of the buffer. A model may be loaded on another device, so that the choice is not stored."""
-        assert self._buffer_class is not None
-        choice = (self._buffer_class, self.observation_space, self.optimize_memory_usage, self.device)
+        buffer_class = replay_buffer_class_of(self)
+        choice = (buffer_class, self.observation_space, self.optimize_memory_usage, self.device)
         if not self.cuda_graphs or not fits_device(*choice):
-            return self._buffer_class
+            return buffer_class
         if leaves_room(self._stored_space(), self.buffer_size, self.device):
             return DeviceReplayBuffer
         message = f"A replay buffer of {self.buffer_size} takes over half of {self.device}'s free memory"
         warnings.warn(f"{message}: it is kept on the host.", stacklevel=2)
-        return self._buffer_class
+        return buffer_class
 
     def _allocate(self, buffer_class: type[ReplayBuffer]) -> ReplayBuffer:
         """Return an empty replay buffer of a class."""
@@ -123,7 +124,7 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
             # `set_env` has added or removed VecNormalize
             if self.replay_buffer.size() == 0:
                 self.replay_buffer = None
-            elif self._is_normalized and self._stored_space() == self.observation_space:
+            elif self._is_normalized:
                 message = "The replay buffer has observations in float32, and `env` normalises them now: those near their"
                 warnings.warn(
                     f"{message} mean may have lost their differences. Train a new model to keep these.", stacklevel=2
@@ -156,11 +157,11 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
 
     def _check_loaded(self, buffer: ReplayBuffer) -> None:
         """Refuse a loaded buffer whose settings contradict the model's arguments, which it would outrank silently."""
-        assert self._buffer_class is not None
-        kinds = [ReplayBuffer if each is DeviceReplayBuffer else each for each in (type(buffer), self._buffer_class)]
+        asked = replay_buffer_class_of(self)
+        kinds = [ReplayBuffer if each is DeviceReplayBuffer else each for each in (type(buffer), asked)]
         # A class of the user's own may do what the arguments ask for
         fits = kinds[0] is kinds[1] or not set(kinds) <= set(SB3_BUFFERS)
-        allowed = f"a {self._buffer_class.__name__}, by the model's `replay_buffer_class`, `n_steps` and observation space"
+        allowed = f"a {asked.__name__}, by the model's `replay_buffer_class`, `n_steps` and observation space"
         require(fits, "replay_buffer", type(buffer).__name__, f"{allowed}: load the model with those of the saved one")
         # A class of the user's own may change its arguments along the training
         kwargs = self.replay_buffer_kwargs if kinds[0] in SB3_BUFFERS else {}
@@ -201,4 +202,4 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_defers_replay_buffer", "_buffer_class"]
+        return [*super()._excluded_save_params(), "_defers_replay_buffer"]
