@@ -106,3 +106,42 @@ def test_an_environment_that_a_callback_sets_within_a_step_is_refused():
     model.learn(20, reset_num_timesteps=False)
     assert np.isfinite(model.replay_buffer.observations).all()
     assert_no_episode_runs_into_another(model.replay_buffer)
+
+
+class Overflowing(Located):
+    """Returns an infinite observation or reward at one of its steps, counted over all episodes."""
+
+    def __init__(self, at, what):
+        super().__init__()
+        self.at, self.what, self.total = at, what, 0
+
+    def step(self, action):
+        self.total += 1
+        observation, reward, *others = super().step(action)
+        if self.total == self.at:
+            observation, reward = (observation * np.inf, reward) if self.what == "observation" else (observation, np.inf)
+        return observation, reward, *others
+
+
+@pytest.mark.filterwarnings("ignore:invalid value encountered")
+@pytest.mark.parametrize("what", ["observation", "reward"])
+@pytest.mark.parametrize("move", ["reset", "step"])
+@pytest.mark.parametrize("own", [True, False], ids=["training's step", "callback's step"])
+def test_the_trainings_own_step_is_checked_and_stored_when_a_callback_moves_a_normalised_environment(what, move, own):
+    env = VecNormalize(DummyVecEnv([lambda: Overflowing(10 if own else 11, what)]))
+
+    def do():
+        env.reset()
+        if move == "step":
+            env.step(np.zeros((1, 1)))
+
+    model = make_model("plain", env=env)
+    callback = Do(10, do)
+    if own:
+        with pytest.raises(ValueError, match=f"NaN or infinite .* {what} at environment step 10"):
+            model.learn(10, callback)
+        assert model.replay_buffer.size() == 9
+    else:
+        model.learn(10, callback)
+        assert np.all(model.replay_buffer.next_observations[:10, :, 1] == model.replay_buffer.observations[:10, :, 1] + 1)
+        assert np.all(model.replay_buffer.rewards[:10] == 1)

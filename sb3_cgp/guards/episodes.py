@@ -109,14 +109,10 @@ class EpisodeGuard(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        own_step, normalizer = self._own_step, self._vec_normalize_env
-        if own_step is not None and own_step.position is not None and normalizer is not None:
-            # A callback may have stepped the same environment since, and SB3 asks VecNormalize for the last step's values
-            normalizer.old_obs, normalizer.old_reward = own_step.normalizer_values
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         # The environment may return an array that its next step overwrites
         self._last_obs = copy_observations(self._last_obs)
-        position = None if own_step is None else own_step.position
+        position = None if self._own_step is None else self._own_step.position
         self._left_env_at = None if position is None else _EnvMark(self._last_obs, position)
         self._own_step = None
 
@@ -127,9 +123,7 @@ class EpisodeGuard(OffPolicyAlgorithm):
     def _note_step(self) -> None:
         """Remember where the model's own step has left the environment, before callbacks are told of it."""
         assert self.env is not None
-        normalizer = self._vec_normalize_env
-        values = None if normalizer is None else (normalizer.old_obs, normalizer.old_reward)
-        self._own_step = _OwnStep(position_of(self.env), values)
+        self._own_step = _OwnStep(position_of(self.env))
 
     def _note_reset(self) -> None:
         """End the replay buffer's last episode after a reset, and remember where the environment is."""
@@ -209,11 +203,10 @@ class _OwnStep:
     A step of the training's own.
 
     :param position: the objects that :func:`~sb3_cgp.guards.observations.position_of` returned after it; None until then
-    :param normalizer_values: the observations and rewards that ``VecNormalize`` was given, if there is one
     """
 
-    def __init__(self, position: tuple[Any, ...] | None = None, normalizer_values: Any = None):
-        self.position, self.normalizer_values = position, normalizer_values
+    def __init__(self, position: tuple[Any, ...] | None = None):
+        self.position = position
 
 
 class _StepObserver:
@@ -228,9 +221,7 @@ class _StepObserver:
 
     def __init__(self, callback: BaseCallback, model: EpisodeGuard):
         self._callback, self._model = callback, model
-        # Bound directly, as SB3 calls them at every step
         self.on_rollout_start, self.on_rollout_end = callback.on_rollout_start, callback.on_rollout_end
-        self.on_step = callback.on_step
 
     def update_locals(self, locals_: dict[str, Any]) -> None:
         """
@@ -241,3 +232,19 @@ class _StepObserver:
         self._model._note_step()
         locals_["callback"] = self._callback
         self._callback.update_locals(locals_)
+
+    def on_step(self) -> bool:
+        """
+        Call the callback, which may step or reset the environment, and give ``VecNormalize`` back what the step returned.
+
+        SB3, and the checks of a transition, ask it for the last step's values.
+
+        :return: whether to go on
+        """
+        normalizer = self._model._vec_normalize_env
+        if normalizer is None:
+            return self._callback.on_step()
+        values = normalizer.old_obs, normalizer.old_reward
+        goes_on = self._callback.on_step()
+        normalizer.old_obs, normalizer.old_reward = values
+        return goes_on
