@@ -35,6 +35,17 @@ def check_action_space(action_space: spaces.Space[Any]) -> None:
     require(is_scalable, "action_space", action_space, allowed)
 
 
+def by_key(whole: Any) -> dict[Any, Any]:
+    """
+    Return the parts of a ``Dict`` space, or of observations of one.
+
+    :param whole: a space, or observations
+    :return: the parts by key; another space, or an array, as a whole by None
+    """
+    parts = whole.spaces if isinstance(whole, spaces.Dict) else whole
+    return parts if isinstance(parts, dict) else {None: parts}
+
+
 def sample_of(space: spaces.Space[Any]) -> Any:
     """
     Draw a random observation, also from a float64 ``Box`` whose bounds are so wide that Gymnasium's ``sample`` overflows.

@@ -8,6 +8,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
+from sb3_cgp.common.spaces import by_key
+
 # Rows that are checked at a time, for the memory that the check takes
 ROWS = 10_000
 SCALED = "scaled to [-1, 1]: add `model.policy.scale_action(action)`, of actions within the bounds of the action space"
@@ -42,5 +44,6 @@ def _arrays(buffer: ReplayBuffer) -> Iterator[tuple[str, np.ndarray | th.Tensor]
     for name in ("observations", "next_observations", "actions", "rewards"):
         # A memory-efficient buffer has no next observations
         value: Any = getattr(buffer, name, None)
-        named = {f"{name}['{key}']": each for key, each in value.items()} if isinstance(value, dict) else {name: value}
-        yield from ((each, array) for each, array in named.items() if isinstance(array, np.ndarray | th.Tensor))
+        for key, array in by_key(value).items():
+            if isinstance(array, np.ndarray | th.Tensor):
+                yield name if key is None else f"{name}['{key}']", array

@@ -178,9 +178,8 @@ class EpisodeGuard(OffPolicyAlgorithm):
             self._vec_normalize_env is not None and self._vec_normalize_env is not self.env
         ):
             return False
-        last = self._original_last_obs
-        shown = bare.buf_obs if isinstance(last, dict) else bare.buf_obs.get(None)  # type: ignore[call-overload]
-        return shown is not None and not same_observations(shown, last)
+        # By the key None where observations have none
+        return not same_observations(bare.buf_obs, self._original_last_obs)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_left_env_at", "_own_step", "_has_warned_of_moves", "_is_in_rollout"]

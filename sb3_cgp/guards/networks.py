@@ -15,7 +15,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cgp.common.random_state import preserved_random_state
 from sb3_cgp.common.rules import require
-from sb3_cgp.common.spaces import sample_of
+from sb3_cgp.common.spaces import by_key, sample_of
 from sb3_cgp.guards.observations import innermost
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -39,7 +39,7 @@ def check_observation_space(space: spaces.Space) -> None:
     :param space: the observation space
     :raises ValueError: naming the space, and the remedy
     """
-    for key, subspace in space.spaces.items() if isinstance(space, spaces.Dict) else [(None, space)]:
+    for key, subspace in by_key(space).items():
         require(
             not isinstance(subspace, spaces.Box) or subspace.shape != (),
             "observation_space" if key is None else f"observation_space['{key}']",

@@ -8,6 +8,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, VecTransposeImage, unwrap_vec_normalize
 
+from sb3_cgp.common.spaces import by_key
 from sb3_cgp.common.statistics import WITH_STATISTICS, count_observations
 
 
@@ -138,11 +139,8 @@ def _check_normalised(observations: Any, original: Any, normalizer: VecNormalize
     """Refuse first observations that a wrapper outside of ``VecNormalize`` has changed without changing their space."""
     if normalizer is None or original is None:
         return
-    expected = normalizer.normalize_obs(original)
-    pairs = (
-        [(observations[key], expected[key]) for key in expected] if isinstance(expected, dict) else [(observations, expected)]
-    )
-    if not all(np.allclose(each, other, equal_nan=True) for each, other in pairs):
+    found, expected = by_key(observations), by_key(normalizer.normalize_obs(original))
+    if not all(np.allclose(found[key], each, equal_nan=True) for key, each in expected.items()):
         raise ValueError(
             "The environment's observations are not those that VecNormalize returned: a wrapper outside of it changes them, "
             "which the replay buffer does not see. Put that wrapper inside of VecNormalize."

@@ -8,6 +8,8 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 
+from sb3_cgp.common.spaces import by_key
+
 
 def innermost(env: VecEnv | None) -> Any:
     """
@@ -85,10 +87,7 @@ def continues_last_episode(buffer: ReplayBuffer, observations: Any) -> bool:
     stored, row = (
         (buffer.observations, buffer.pos) if buffer.optimize_memory_usage else (buffer.next_observations, buffer.pos - 1)
     )
-    if isinstance(stored, dict):
-        pairs = [(_array(stored[key][row]), _array(observations[key])) for key in stored]
-    else:
-        pairs = [(_array(stored[row]), _array(observations))]
+    pairs = [(_array(each[row]), _array(by_key(observations)[key])) for key, each in by_key(stored).items()]
     return all(
         np.array_equal(last[goes_on], new.reshape(last.shape).astype(last.dtype)[goes_on], equal_nan=True)
         for last, new in pairs
@@ -106,7 +105,7 @@ def count_envs(observations: Any) -> int | None:
     :param observations: the observations, (N, *shape), by key for ``Dict`` spaces
     :return: N; None if there are no observations
     """
-    first = next(iter(observations.values())) if isinstance(observations, dict) else observations
+    first = next(iter(by_key(observations).values()))
     return None if first is None else len(first)
 
 
@@ -130,6 +129,4 @@ def same_observations(first: Any, second: Any) -> bool:
     :param second: an array, or arrays by key, all of which are compared
     :return: whether shapes and values are equal
     """
-    if isinstance(second, dict):
-        return all(same_observations(first[key], value) for key, value in second.items())
-    return np.shape(first) == np.shape(second) and np.array_equal(first, second)
+    return all(np.array_equal(by_key(first)[key], value) for key, value in by_key(second).items())

@@ -15,6 +15,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs
 
+from sb3_cgp.common.spaces import by_key
 from sb3_cgp.guards.explanations import OLD_RESET
 from sb3_cgp.guards.observations import innermost
 
@@ -120,11 +121,10 @@ class BoundsWatch:
     """
 
     def __init__(self, space: spaces.Space):
-        subspaces = space.spaces if isinstance(space, spaces.Dict) else {None: space}
         # Integers, such as images, cannot leave the bounds of their type
         self._boxes = {
             key: box
-            for key, box in subspaces.items()
+            for key, box in by_key(space).items()
             if isinstance(box, spaces.Box)
             and np.issubdtype(box.dtype, np.floating)
             and (box.bounded_below.any() or box.bounded_above.any())
@@ -146,7 +146,7 @@ class BoundsWatch:
         :param timestep: the environment step
         """
         for key, box in self._boxes.items():
-            values = observation if key is None else observation[key]  # type: ignore[call-overload]
+            values = by_key(observation)[key]
             outside = (values < box.low) | (values > box.high)
             if outside.any():
                 self._warn(key, box, np.asarray(values), outside, timestep)
@@ -179,7 +179,7 @@ def check_shape(name: str, values: Any, space: spaces.Space, n_envs: int | None,
     :raises ValueError: naming the shape and the one that is expected
     """
     batch = () if n_envs is None else (n_envs,)
-    for key, subspace in space.spaces.items() if isinstance(space, spaces.Dict) else [(None, space)]:
+    for key, subspace in by_key(space).items():
         shape, expected = np.shape(values if key is None else values[key]), (*batch, *(subspace.shape or ()))
         # NumPy may drop leading axes of length 1, or add them: no number is lost or repeated
         if shape != expected and _without_leading_ones(shape) != _without_leading_ones(expected):
@@ -195,7 +195,7 @@ def check_finite(name: str, values: Any, timestep: int) -> None:
     :param timestep: the environment step
     :raises ValueError: if a value is NaN or infinite
     """
-    for key, array in values.items() if isinstance(values, dict) else [(None, values)]:
+    for key, array in by_key(values).items():
         # False for NaN, too
         if not (np.abs(array) <= LARGEST_FLOAT32).all():
             which = name if key is None else f"{name} `{key}`"
