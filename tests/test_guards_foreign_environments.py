@@ -1,5 +1,6 @@
 """Vectorised environments of other packages: arrays that they overwrite, and what they lack."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from guarded import IGNORED_WARNINGS, SMALL, GuardedTD3, Located, assert_no_episode_runs_into_another, located, make_model
@@ -48,6 +49,36 @@ def test_a_final_observation_that_reset_overwrites_is_copied():
     assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)
     ends = model.replay_buffer.dones[:30] == 1
     np.testing.assert_array_equal(model.replay_buffer.next_observations[:30][ends][:, 1], 7)
+
+
+class Forwarding(gym.Wrapper):
+    """Is one with what it wraps: attributes that are set on it are the environment's own."""
+
+    def __setattr__(self, name, value):
+        super().__setattr__(name, value) if name.startswith("_") or name == "env" else setattr(self.env, name, value)
+
+
+class Restarting(Located):
+    """Begins its next episode by itself, by a positional call of its own method."""
+
+    def reset(self, seed=None, options=None):
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        returned = super().step(action)
+        if returned[3]:
+            self.reset(None)
+        return returned
+
+
+@pytest.mark.parametrize("make_env", [lambda: Forwarding(Reusing()), Restarting], ids=["forwarding", "restarting"])
+def test_environments_that_a_method_of_another_kind_would_break_are_trained_on(make_env):
+    model = make_model("n-step", env=DummyVecEnv([make_env]))
+    model.learn(30)
+    assert model.replay_buffer.dones.sum() == 30 // 7
+    assert "reset" not in vars(model.env.envs[0].unwrapped)
+    model.learn(30)
+    assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)
 
 
 class Foreign(VecEnv):

@@ -1,8 +1,9 @@
 """Observations that a ``DummyVecEnv`` would change before anything else sees them."""
 
 import copy
+import functools
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, TypeVar
 
@@ -39,15 +40,16 @@ class DummyVecEnvGuard(OffPolicyAlgorithm):
             return super().learn(*args, **kwargs)
         with ExitStack() as stack:
             # A private method, as nothing outside of the environment sees an observation before it is collected
-            stack.enter_context(_shadowed(env, "_save_obs", _CheckedObservations(env, self).save))
+            observer = _ObservationObserver(env, self)
+            stack.enter_context(_shadowed(env, "_save_obs", observer.save))
             for index, each in enumerate(env.envs):
-                stack.enter_context(_shadowed(each, "reset", _KeptFinalObservation(env, index, each.reset).reset))
+                stack.enter_context(_shadowed(each, "reset", functools.partial(observer.reset, index, each.reset)))
             return super().learn(*args, **kwargs)
 
 
-class _CheckedObservations:
+class _ObservationObserver:
     """
-    Check each observation before a ``DummyVecEnv`` collects it. A copy that is made during a training checks nothing.
+    See each observation before a ``DummyVecEnv`` collects it. A copy that is made during a training checks nothing.
 
     :param env: the environment
     :param model: the model that is learning
@@ -72,44 +74,36 @@ class _CheckedObservations:
             check_shape("observation", obs, self._env.observation_space, None, model.num_timesteps)
         type(self._env)._save_obs(self._env, env_idx, obs)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"_model": None}
-
-
-class _KeptFinalObservation:
-    """
-    Copy an episode's final observation before the environment is reset, which may overwrite it.
-
-    :param vec_env: the environment's ``DummyVecEnv``
-    :param index: the environment's index in it
-    :param reset: the environment's own method
-    """
-
-    def __init__(self, vec_env: DummyVecEnv, index: int, reset: Any):
-        self._vec_env, self._index, self._reset = vec_env, index, reset
-
-    def reset(self, **kwargs: Any) -> Any:
+    def reset(self, env_idx: int, reset: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """
-        Reset the environment.
+        Reset one of the environments, which may overwrite its episode's final observation: that is copied before.
 
-        :param kwargs: the arguments of its own method
+        :param env_idx: the environment's index
+        :param reset: its own method
+        :param args: the arguments of that
+        :param kwargs: the same by keyword
         :return: what that returns
         """
-        info = self._vec_env.buf_infos[self._index]
+        info = self._env.buf_infos[env_idx]
         if "terminal_observation" in info:
             info["terminal_observation"] = copy.deepcopy(info["terminal_observation"])
-        return self._reset(**kwargs)
+        return reset(*args, **kwargs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_model": None}
 
 
 @contextmanager
 def _shadowed(owner: DummyVecEnv | gym.Env, name: str, method: Any) -> Iterator[None]:
     """Put a method in the place of an object's own for a time, in which a nested training may do the same."""
-    before = vars(owner).get(name)
-    setattr(owner, name, method)
+    # Not by `setattr`, which a wrapper may forward to what it wraps
+    attributes = vars(owner)
+    before = attributes.get(name)
+    attributes[name] = method
     try:
         yield
     finally:
         if before is None:
-            delattr(owner, name)
+            del attributes[name]
         else:
-            setattr(owner, name, before)
+            attributes[name] = before
