@@ -251,6 +251,21 @@ def test_a_nan_is_refused_before_it_is_stored(fault, make_vec_env):
     env.close()
 
 
+@pytest.mark.filterwarnings("ignore:invalid value encountered")
+@pytest.mark.parametrize("observation", [np.full(3, np.inf), np.full(3, -1e100), np.full(3, np.nan), np.ones(1)], ids=str)
+@pytest.mark.parametrize("at", [14, 15], ids=["within", "last"])
+def test_observations_are_checked_before_they_are_normalised(observation, at):
+    """VecNormalize clips them, and broadcasts the last one of an episode."""
+    env = VecNormalize(DummyVecEnv([lambda: Failing(with_observation(observation), at)]))
+    model = CGP("MlpPolicy", env, **SMALL)
+    with pytest.raises(ValueError, match=r"(NaN or infinite|wrong shape) .*at environment step 1[3-5]"):
+        model.learn(300)
+    assert model.replay_buffer.size() == at - 1
+    if at == 15:
+        # The statistics, which VecNormalize updates first, have not seen it
+        assert model.learn(5, reset_num_timesteps=False).num_timesteps >= 19
+
+
 @pytest.mark.parametrize("normalised", [False, True])
 def test_observations_out_of_bounds_are_warned_of_once(normalised):
     low = np.array([-5.0, -np.inf, -5.0])

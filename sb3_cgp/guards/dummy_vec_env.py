@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_cgp.guards.explanations import OLD_RESET
 from sb3_cgp.guards.observations import innermost
-from sb3_cgp.guards.transitions import check_shape
+from sb3_cgp.guards.transitions import check_final_observation, check_shape
 
 SelfDummyVecEnvGuard = TypeVar("SelfDummyVecEnvGuard", bound="DummyVecEnvGuard")
 
@@ -22,8 +22,8 @@ class DummyVecEnvGuard(OffPolicyAlgorithm):
     """
     An algorithm that sees the observations of a ``DummyVecEnv`` as its environments return them.
 
-    It refuses those that NumPy would broadcast to the array in which a ``DummyVecEnv`` collects them. It copies an episode's
-    final one before the environment's ``reset`` can overwrite it.
+    It refuses those that NumPy would broadcast to the array in which a ``DummyVecEnv`` collects them. It checks an episode's
+    final one before ``VecNormalize`` clips it, and copies it before the environment's ``reset`` can overwrite it.
     """
 
     def learn(self: SelfDummyVecEnvGuard, *args: Any, **kwargs: Any) -> SelfDummyVecEnvGuard:
@@ -76,17 +76,25 @@ class _ObservationObserver:
 
     def reset(self, env_idx: int, reset: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """
-        Reset one of the environments, which may overwrite its episode's final observation: that is copied before.
+        Reset one of the environments, after checking and copying its episode's final observation, which it may overwrite.
+
+        ``VecNormalize`` would broadcast and clip that observation before any other check.
 
         :param env_idx: the environment's index
         :param reset: its own method
         :param args: the arguments of that
         :param kwargs: the same by keyword
         :return: what that returns
+        :raises ValueError: if the final observation is of a wrong shape, NaN or infinite
         """
         info = self._env.buf_infos[env_idx]
-        if "terminal_observation" in info:
-            info["terminal_observation"] = copy.deepcopy(info["terminal_observation"])
+        # Taken out, so that the next reset does not find one that is refused
+        final = info.pop("terminal_observation", None)
+        if final is not None:
+            model = None if self._model is None else self._model()
+            if model is not None:
+                check_final_observation(final, self._env.observation_space, model.num_timesteps + self._env.num_envs)
+            info["terminal_observation"] = copy.deepcopy(final)
         return reset(*args, **kwargs)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -109,8 +109,7 @@ def check_final_observations(transition: Transition) -> None:
     :raises ValueError: naming the shape or the values
     """
     for observation in transition.final_observations:
-        check_shape("terminal observation", observation, transition.observation_space, None, transition.timestep)
-        check_finite("terminal observation", observation, transition.timestep)
+        check_final_observation(observation, transition.observation_space, transition.timestep)
 
 
 class BoundsWatch:
@@ -203,6 +202,19 @@ def check_finite(name: str, values: Any, timestep: int) -> None:
                 f"The environment returned a NaN or infinite (in float32) {which} at environment step {timestep}: {array}. "
                 "It was not stored, and the networks are as before it."
             )
+
+
+def check_final_observation(observation: Any, space: spaces.Space, timestep: int) -> None:
+    """
+    Refuse an episode's last observation if it is of a wrong shape, NaN or infinite.
+
+    :param observation: the observation of one environment
+    :param space: the observation space
+    :param timestep: the environment step
+    :raises ValueError: naming the shape or the values
+    """
+    check_shape("terminal observation", observation, space, None, timestep)
+    check_finite("terminal observation", observation, timestep)
 
 
 def _wrong_shape(name: str, shape: tuple[int, ...], expected: tuple[int, ...], timestep: int) -> ValueError:
