@@ -81,6 +81,25 @@ def test_environments_that_a_method_of_another_kind_would_break_are_trained_on(m
     assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)
 
 
+class Commenting(Located):
+    """Has a key in its observations that their space lacks."""
+
+    def __init__(self):
+        super().__init__(goals=True)
+
+    def observe(self):
+        return super().observe() | {"note": "running", "unknown": np.nan}
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, VecNormalize, VecMonitor])
+def test_keys_that_the_observation_space_lacks_are_not_looked_at(wrap):
+    guarded, plain = (
+        algorithm("MultiInputPolicy", wrap(DummyVecEnv([Commenting])), **SMALL).learn(20) for algorithm in (GuardedTD3, TD3)
+    )
+    assert guarded._n_updates == plain._n_updates == 14
+    np.testing.assert_array_equal(guarded.replay_buffer.dones, plain.replay_buffer.dones)
+
+
 class Foreign(VecEnv):
     """A vectorised environment of another package, which keeps neither actions nor infos, as simulators on a GPU."""
 

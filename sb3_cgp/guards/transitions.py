@@ -98,7 +98,7 @@ def check_finite_values(transition: Transition) -> None:
     """
     if transition.rewards is not None:
         check_finite("reward", transition.rewards, transition.timestep)
-    check_finite("observation", transition.observations, transition.timestep)
+    check_finite("observation", _stored(transition.observations, transition.observation_space), transition.timestep)
 
 
 def check_final_observations(transition: Transition) -> None:
@@ -214,7 +214,12 @@ def check_final_observation(observation: Any, space: spaces.Space, timestep: int
     :raises ValueError: naming the shape or the values
     """
     check_shape("terminal observation", observation, space, None, timestep)
-    check_finite("terminal observation", observation, timestep)
+    check_finite("terminal observation", _stored(observation, space), timestep)
+
+
+def _stored(observation: Any, space: spaces.Space) -> dict[Any, Any]:
+    """Return the parts of an observation that its space has: further keys of a ``Dict`` may hold anything."""
+    return {key: by_key(observation)[key] for key in by_key(space)}
 
 
 def _wrong_shape(name: str, shape: tuple[int, ...], expected: tuple[int, ...], timestep: int) -> ValueError:
