@@ -38,6 +38,11 @@ class EmptyReset(Located):
         super().reset()
 
 
+class NoResetInfo(Located):
+    def reset(self, *, seed=None, options=None):
+        return super().reset()[0], None
+
+
 class OldStep(Located):
     def step(self, action):
         observation, reward, terminated, truncated, info = super().step(action)
@@ -83,11 +88,12 @@ def wrapped_by_another_package(env):
         (OlderReset, r"`reset` must take `seed` and `options` and return two values"),
         (LongOldReset, r"`reset` must take `seed` and `options` and return two values"),
         (EmptyReset, r"`reset` must take `seed` and `options` and return two values"),
+        (NoResetInfo, r"`reset` must return a dictionary as its last value, `info`; an empty one, `{}`, will do"),
         (OldStep, r"`step` must return five values"),
         (NoInfo, r"`step` must return a dictionary as its last value"),
     ],
 )
-def test_an_environment_of_an_old_api_is_told_what_to_return(wrap, env, message):
+def test_an_environment_of_an_old_api_or_without_information_is_told_what_to_return(wrap, env, message):
     model = GuardedTD3("MlpPolicy", wrap(env()), **SMALL)
     with pytest.raises(ValueError, match=f"The environment's {message}"):
         model.learn(20)
@@ -109,10 +115,11 @@ def test_an_old_reset_is_noticed_within_a_training_too():
     assert model.replay_buffer.size() == 6
 
 
-def test_an_old_reset_of_a_worker_that_passes_for_a_new_one_is_noticed():
-    env = SubprocVecEnv([OldReset], start_method="fork")
+@pytest.mark.parametrize(("kind", "message"), [(OldReset, "`reset` must take"), (NoResetInfo, "`reset` must return a dict")])
+def test_an_old_reset_of_a_worker_that_passes_for_a_new_one_is_noticed(kind, message):
+    env = SubprocVecEnv([kind], start_method="fork")
     model = GuardedTD3("MlpPolicy", env, **SMALL)
-    with pytest.raises(ValueError, match="`reset` must take"):
+    with pytest.raises(ValueError, match=message):
         model.learn(20)
     env.close()
 

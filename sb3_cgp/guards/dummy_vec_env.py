@@ -11,7 +11,7 @@ import gymnasium as gym
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_cgp.guards.explanations import OLD_RESET
+from sb3_cgp.guards.explanations import check_reset_info
 from sb3_cgp.guards.observations import innermost
 from sb3_cgp.guards.transitions import check_final_observation, check_shape
 
@@ -33,7 +33,7 @@ class DummyVecEnvGuard(OffPolicyAlgorithm):
         :param args: the algorithm's own arguments
         :param kwargs: the algorithm's own arguments
         :return: the trained model
-        :raises ValueError: if an observation is of a wrong shape, or ``reset`` has the old API
+        :raises ValueError: if an observation is of a wrong shape, or ``reset`` returns no dictionary beside it
         """
         env = innermost(self.env)
         if not isinstance(env, DummyVecEnv):
@@ -65,12 +65,11 @@ class _ObservationObserver:
 
         :param env_idx: the environment's index
         :param obs: its observation
-        :raises ValueError: if it is of a wrong shape, or ``reset`` has the old API
+        :raises ValueError: if it is of a wrong shape, or ``reset`` returns no dictionary beside it
         """
         model = None if self._model is None else self._model()
         if model is not None:
-            if not isinstance(self._env.reset_infos[env_idx], dict):
-                raise ValueError(OLD_RESET)
+            check_reset_info(self._env.reset_infos[env_idx])
             check_shape("observation", obs, self._env.observation_space, None, model.num_timesteps)
         type(self._env)._save_obs(self._env, env_idx, obs)
 

@@ -33,7 +33,7 @@ OLD_VEC_STEP = (
     "The vectorised environment's `step_wait` must return four values, `observations, rewards, dones, infos`, as SB3's do: "
     "`dones` are ends of any kind, and the info of an episode that ran out of time has `TimeLimit.truncated` True."
 )
-NO_INFO = "The environment's `step` must return a dictionary as its last value, `info`; an empty one, `{}`, will do."
+NO_INFO = "The environment's `{}` must return a dictionary as its last value, `info`; an empty one, `{{}}`, will do."
 
 
 class ExplanationGuard(OffPolicyAlgorithm):
@@ -65,6 +65,20 @@ class ExplanationGuard(OffPolicyAlgorithm):
             if message is None:
                 raise
             raise ValueError(message) from error
+
+
+def check_reset_info(info: Any) -> None:
+    """
+    Check the second value of an environment's ``reset``, by which another reset is noticed.
+
+    :param info: the value
+    :raises ValueError: if it is no dictionary
+    """
+    if info is None:
+        raise ValueError(NO_INFO.format("reset"))
+    if not isinstance(info, dict):
+        # A part of an observation, which is all that the old API returns
+        raise ValueError(OLD_RESET)
 
 
 def explain(error: Exception, model: OffPolicyAlgorithm) -> str | None:
@@ -107,7 +121,7 @@ def _explain_old_api(error: str, line: str) -> str | None:
     if called is not None and re.search(r"reset\(\) (got an unexpected keyword|takes)", error):
         return OLD_RESET
     if "does not support item assignment" in error and "info" in line:
-        return NO_INFO
+        return NO_INFO.format("step")
     return None
 
 

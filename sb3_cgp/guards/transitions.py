@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs
 
 from sb3_cgp.common.spaces import by_key
-from sb3_cgp.guards.explanations import OLD_RESET
+from sb3_cgp.guards.explanations import check_reset_info
 from sb3_cgp.guards.observations import innermost
 
 LARGEST_FLOAT32 = np.finfo(np.float32).max
@@ -253,8 +253,9 @@ class TransitionGuard(OffPolicyAlgorithm):
         assert observations is not None
         bare = innermost(self.env)
         # Environments of other packages may keep no infos
-        if isinstance(bare, DummyVecEnv | SubprocVecEnv) and not all(isinstance(info, dict) for info in bare.reset_infos):
-            raise ValueError(OLD_RESET)
+        if isinstance(bare, DummyVecEnv | SubprocVecEnv):
+            for info in bare.reset_infos:
+                check_reset_info(info)
         self._check(Transition(self.num_timesteps, self.observation_space, observations, None, [], self.n_envs))
 
     def _store_transition(
