@@ -142,6 +142,8 @@ class PopulationMembers(OverlappedTraining):
             # The axis of the log continues after the steps of all environments
             agent.num_timesteps = self.num_timesteps
             agent.set_logger(AgentLogger(self.logger, index))
+            # A population logs none of its agents'
+            agent.diagnostics = False
             try:
                 self.policy.copy_actor_from(agent.train_policy(), index)
             except ValueError as error:
