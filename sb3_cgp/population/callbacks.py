@@ -140,13 +140,4 @@ class PopulationEvalCallback(EventCallback):
         self.logger.record("eval/mean_ep_length", float(lengths.mean()))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
-        return self._on_event() if self.callback is not None else True
-
-    def update_child_locals(self, locals_: dict[str, Any]) -> None:
-        """
-        Update the references to the local variables.
-
-        :param locals_: the local variables during rollout collection
-        """
-        if self.callback is not None:
-            self.callback.update_locals(locals_)
+        return self._on_event()

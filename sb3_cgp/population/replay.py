@@ -96,10 +96,4 @@ def copied_column(buffer: ReplayBuffer, agent: int) -> ReplayBuffer:
     :param agent: the agent's index
     :return: the copy
     """
-    own = column(buffer, agent)
-    for name, value in vars(own).items():
-        if isinstance(value, th.Tensor):
-            setattr(own, name, value.clone())
-        elif isinstance(value, np.ndarray):
-            setattr(own, name, copy.deepcopy(value))
-    return own
+    return copy.deepcopy(column(buffer, agent))
