@@ -68,15 +68,21 @@ def merge_arguments(agents: int | Sequence[Arguments], common: Arguments) -> lis
     # JSON, in which SB3 saves, has no tuples
     merged = [_with_plain_train_freq(_with_plain_seed(common | seeds[index] | own)) for index, own in enumerate(agents)]
     for name in COMMON:
-        first, *others = (_value_of(name, arguments) for arguments in merged)
+        first, *others = (value_of(name, arguments) for arguments in merged)
         for index, value in enumerate(others, start=1):
             allowed = f"{first!r}, as agent 0 has it: agents that differ in `{name}` make several populations"
             require(value == first, f"agents[{index}]['{name}']", value, allowed)
     return merged
 
 
-def _value_of(name: str, arguments: Arguments) -> Any:
-    """Return the value of an argument, or its default. No keyword arguments are an empty dictionary of them."""
+def value_of(name: str, arguments: Arguments) -> Any:
+    """
+    Return the value of an argument of an agent.
+
+    :param name: the argument's name
+    :param arguments: the arguments that are given
+    :return: its value, or CGP's default; for no keyword arguments, an empty dictionary
+    """
     value = arguments.get(name, DEFAULTS[name])
     return {} if value is None and name.endswith("_kwargs") else value
 
@@ -87,7 +93,7 @@ def _with_plain_seed(arguments: Arguments) -> Arguments:
 
 
 def _with_plain_train_freq(arguments: Arguments) -> Arguments:
-    frequency = arguments.get("train_freq", 1)
+    frequency = value_of("train_freq", arguments)
     if not isinstance(frequency, tuple) or len(frequency) != 2:
         return arguments
     unit = getattr(frequency[1], "value", frequency[1])
@@ -116,7 +122,7 @@ def make_agent(
     # Noise may have a state. The population prints the device once.
     own = arguments | {"action_noise": copy.deepcopy(arguments.get("action_noise")), "verbose": 0}
     agent = CGP(policy, None, device=device, _init_setup_model=False, **own)  # type: ignore[arg-type]
-    agent.verbose = arguments.get("verbose", 0)
+    agent.verbose = value_of("verbose", arguments)
     # As SB3's `load` does for a model without an environment
     agent.observation_space, agent.action_space = observation_space, action_space
     agent.n_envs, agent._defers_replay_buffer = 1, True
@@ -144,14 +150,14 @@ def check_supported(policy: Any, arguments: Arguments) -> None:
     :raises ValueError: naming the argument, its value, and what is allowed
     """
     require(policy in POLICIES, "policy", policy, "'MlpPolicy' in a population")
-    buffer_class = arguments.get("replay_buffer_class")
+    buffer_class = value_of("replay_buffer_class", arguments)
     allowed = "None in a population, which samples the columns of SB3's own buffers"
     require(buffer_class is None, "replay_buffer_class", buffer_class, allowed)
-    saves_memory = arguments.get("optimize_memory_usage", False)
+    saves_memory = value_of("optimize_memory_usage", arguments)
     require(not saves_memory, "optimize_memory_usage", saves_memory, "False in a population")
-    loss = arguments.get("policy_loss", "cgp")
+    loss = value_of("policy_loss", arguments)
     require(loss in ("cgp", "qgp", None), "policy_loss", loss, "'cgp', 'qgp' or None in a population")
-    dtype = arguments.get("cem_dtype", "auto")
+    dtype = value_of("cem_dtype", arguments)
     require(dtype != "bfloat16", "cem_dtype", dtype, "'auto' or 'float32' in a population, which scores in float32")
 
 

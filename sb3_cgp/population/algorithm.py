@@ -27,6 +27,7 @@ from sb3_cgp.population.agents import (
     join_action_noise,
     make_agent,
     merge_arguments,
+    value_of,
 )
 from sb3_cgp.population.gradient_step import AgentNumbers
 from sb3_cgp.population.make_environments import make_agents_env
@@ -78,21 +79,21 @@ class Population(ResumableAlgorithm, PopulationMembers):
     ):
         self.agents = merge_arguments(agents, arguments)
         self.overlap = overlap
-        self.cuda_graphs = self.agents[0].get("cuda_graphs", True)
+        first = self.agents[0]
+        self.cuda_graphs = value_of("cuda_graphs", first)
         self._failures: list[str | None] = [None] * len(self.agents)
         self._agent_updates = np.zeros(len(self.agents), dtype=np.int64)
         self._policies_trained, self._policies_due = (np.zeros(len(self.agents), dtype=bool) for _ in range(2))
-        first = self.agents[0]
         super().__init__(
             policy,
             make_agents_env(env, len(self.agents)),
-            first.get("learning_rate", 1e-3),
-            policy_kwargs=first.get("policy_kwargs"),
-            replay_buffer_kwargs=first.get("replay_buffer_kwargs"),
-            stats_window_size=first.get("stats_window_size", 100),
-            tensorboard_log=first.get("tensorboard_log"),
-            verbose=first.get("verbose", 0),
-            seed=first.get("seed"),
+            value_of("learning_rate", first),
+            policy_kwargs=value_of("policy_kwargs", first),
+            replay_buffer_kwargs=value_of("replay_buffer_kwargs", first),
+            stats_window_size=value_of("stats_window_size", first),
+            tensorboard_log=value_of("tensorboard_log", first),
+            verbose=value_of("verbose", first),
+            seed=value_of("seed", first),
             device=device,
             support_multi_env=True,
             sde_support=False,
@@ -159,7 +160,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
         """
         selector = self.policy.selector
         if selector is not self._initial_selector:
-            policy_kwargs = {**(self.agents[0].get("policy_kwargs") or {}), "selector": selector}
+            policy_kwargs = {**value_of("policy_kwargs", self.agents[0]), "selector": selector}
             self.agents = [arguments | {"policy_kwargs": policy_kwargs} for arguments in self.agents]
             self.policy_kwargs, self._initial_selector = policy_kwargs, selector
         super().save(*args, **kwargs)

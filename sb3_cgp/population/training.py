@@ -23,7 +23,7 @@ from sb3_cgp.guards.paths import PathGuard
 from sb3_cgp.guards.seeds import SeedGuard
 from sb3_cgp.guards.transitions import TransitionGuard
 from sb3_cgp.guards.workers import WorkerGuard
-from sb3_cgp.population.agents import Arguments
+from sb3_cgp.population.agents import Arguments, value_of
 from sb3_cgp.population.gradient_step import AgentNumbers, GradientStep
 from sb3_cgp.population.policies import PopulationPolicy, SelectFunction
 from sb3_cgp.population.replay import sample_columns
@@ -70,11 +70,11 @@ class PopulationTraining(
 
     @property
     def _policy_loss(self) -> str | None:
-        return self.agents[0].get("policy_loss", "cgp")
+        return value_of("policy_loss", self.agents[0])
 
     @property
     def _trains_online(self) -> bool:
-        return self._policy_loss is not None and self.agents[0].get("policy_training", "online") == "online"
+        return self._policy_loss is not None and value_of("policy_training", self.agents[0]) == "online"
 
     @property
     def _trains_offline(self) -> bool:
