@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from guarded import IGNORED_WARNINGS, SMALL, GuardedTD3, Located, assert_no_episode_runs_into_another, located, make_model
 from gymnasium.wrappers import TimeLimit
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
@@ -145,3 +146,42 @@ def test_the_trainings_own_step_is_checked_and_stored_when_a_callback_moves_a_no
         model.learn(10, callback)
         assert np.all(model.replay_buffer.next_observations[:10, :, 1] == model.replay_buffer.observations[:10, :, 1] + 1)
         assert np.all(model.replay_buffer.rewards[:10] == 1)
+
+
+class Counting(Located):
+    """Has a number of the user's, by the names of the counters of SB3's and Gymnasium's wrappers."""
+
+    total_steps, _elapsed_steps, rewards = 0, 0, 0
+
+    def set_progress(self, number):
+        self.total_steps = self._elapsed_steps = self.rewards = number
+
+
+class SetProgress(BaseCallback):
+    """Tells the environment how far the training is, at every step."""
+
+    def __init__(self, function):
+        super().__init__()
+        self.function = function
+
+    def _on_step(self):
+        self.function(self.training_env, self.num_timesteps)
+        return True
+
+
+@pytest.mark.filterwarnings("error:The training environment was reset or stepped")
+@pytest.mark.parametrize(
+    "wrap", [lambda env: env, Monitor, lambda env: TimeLimit(env, 20)], ids=["bare", "Monitor", "TimeLimit"]
+)
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda env, number: env.env_method("set_progress", number),
+        lambda env, number: env.set_attr("total_steps", 1000 - number),
+    ],
+    ids=["by a method", "by an attribute"],
+)
+def test_an_environment_whose_own_attributes_a_callback_sets_has_not_moved(wrap, function):
+    model = make_model("n-step", env=DummyVecEnv([lambda: wrap(Counting())])).learn(40, SetProgress(function))
+    assert model.replay_buffer.dones.sum() == 40 // 7
+    assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)

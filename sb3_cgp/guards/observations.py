@@ -5,7 +5,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_cgp.common.spaces import by_key
@@ -30,8 +32,9 @@ def position_of(env: VecEnv) -> tuple[Any, ...]:
     List what tells whether an environment was stepped or reset: objects, which SB3's environments replace, and counters.
 
     A ``DummyVecEnv`` keeps the last actions, and the ``info`` of each environment's last reset. A ``SubprocVecEnv`` keeps the
-    latter in a new tuple. The environments within a ``DummyVecEnv``, which others may step too, count their steps in SB3's
-    ``Monitor`` and in Gymnasium's ``TimeLimit``. Vectorised environments of other packages are not known to do so.
+    latter in a new tuple. The environments within a ``DummyVecEnv``, which others may step too, have SB3's ``Monitor``, which
+    lists the rewards of an episode, or Gymnasium's ``TimeLimit``, which counts its steps. Vectorised environments of other
+    packages are not known to do so.
 
     :param env: the environment
     :return: the objects and counters, to be compared by :func:`same_position`; none for other packages' environments
@@ -44,20 +47,22 @@ def position_of(env: VecEnv) -> tuple[Any, ...]:
     position = [vars(bare).get("actions"), *(infos if isinstance(infos, list) else [infos])]
     if isinstance(bare, DummyVecEnv):
         for each in bare.envs:
-            position += _counters(each)
+            position += _marks(each)
     return tuple(position)
 
 
-def _counters(env: gym.Env) -> list[int]:
-    """List the counters of an environment and its wrappers that change when they are stepped or reset."""
-    counters = []
-    while True:
-        attributes = vars(env)
-        counters += [attributes[name] for name in ("_elapsed_steps", "total_steps") if type(attributes.get(name)) is int]
-        if not isinstance(env, gym.Wrapper):
-            break
+def _marks(env: gym.Env) -> list[Any]:
+    """List what changes in an environment's wrappers when they are stepped or reset."""
+    marks: list[Any] = []
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, Monitor):
+            # A new list in each episode. Not `total_steps`, a name that `VecEnv.set_attr` may set for the environment within.
+            marks += [env.rewards, len(env.rewards)]
+        if isinstance(env, TimeLimit):
+            # Gymnasium has no public attribute for it
+            marks.append(env._elapsed_steps)
         env = env.env
-    return counters
+    return marks
 
 
 def same_position(first: tuple[Any, ...], second: tuple[Any, ...]) -> bool:
