@@ -231,11 +231,20 @@ def test_a_population_refuses_the_same_arguments(name):
         dict(policy_kwargs=MappingProxyType(dict(net_arch=[4]))),
         dict(optimize_memory_usage=0),
         dict(stats_window_size=None),
+        dict(learning_starts=4.0),
+        dict(learning_starts=np.float32(4)),
+        dict(learning_rate=np.float32(1e-3)),
+        dict(learning_rate=np.float16(1e-3), actor_learning_rate=np.float32(1e-4)),
+        dict(learning_rate=lambda _: np.float32(1e-3), actor_learning_rate=1),
     ],
 )
 def test_equivalent_values_are_taken(arguments, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    make(**arguments | dict(learning_starts=4)).learn(6)
+    model = make(**dict(learning_starts=4) | arguments).learn(6)
+    assert repr(model.learning_starts) == "4"
+    assert model._n_updates == 2
+    population = Population("MlpPolicy", "Pendulum-v1", 2, **SMALL | dict(learning_starts=4) | arguments).learn(2 * 6)
+    assert repr(population.learning_starts) == "8"
 
 
 def test_seeds_of_numpy_are_those_of_python(saved):

@@ -13,7 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
-from sb3_cgp.common.rules import require, require_count, require_number
+from sb3_cgp.common.rules import as_count, require, require_count, require_number
 
 LINEAR_SCHEDULE_PREFIX = "lin_"
 
@@ -47,7 +47,8 @@ def as_schedule(rate: float | Schedule | str) -> Schedule:
     """
     if isinstance(rate, str):
         return LinearSchedule(float(rate.removeprefix(LINEAR_SCHEDULE_PREFIX)), 0.0, 1.0)
-    return FloatSchedule(rate)
+    # SB3 refuses NumPy's numbers
+    return FloatSchedule(rate if callable(rate) else float(rate))
 
 
 def check_learning_rate(name: str, value: Any) -> None:
@@ -112,12 +113,13 @@ def check_off_policy_arguments(model: OffPolicyAlgorithm) -> None:
     """
     Check the arguments that an algorithm has from SB3's ``OffPolicyAlgorithm``, as attributes of the model.
 
-    :param model: the model, before its networks are built
+    :param model: the model, before its networks are built; a ``learning_starts`` such as 1e4 becomes an integer
     :raises ValueError: naming the first argument that breaks a rule, its value and what is allowed
     """
     for name in ("batch_size", "buffer_size", "n_steps"):
         require_count(name, getattr(model, name))
-    require_count("learning_starts", model.learning_starts, minimum=0)
+    # The only one of these counts that SB3 takes as a float
+    model.learning_starts = as_count("learning_starts", model.learning_starts, minimum=0)
     require_count("gradient_steps", model.gradient_steps, minimum=-1)
     check_train_freq(model.train_freq, model.n_envs)
     for name in ("tau", "gamma"):

@@ -13,7 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_cgp.common.load_arguments import SavedModel, check_load_arguments, misspelt_custom_objects, saved_attribute_names
-from sb3_cgp.common.rules import require
+from sb3_cgp.common.rules import as_count, require
 from sb3_cgp.common.sb3_arguments import constructor_argument_names
 from sb3_cgp.guards.construction import check_constructor_arguments
 
@@ -53,7 +53,9 @@ class ArgumentGuard(OffPolicyAlgorithm):
         :return: the trained model
         :raises ValueError: naming the first argument that is wrong, its value and what is allowed
         """
-        total_timesteps = as_total_timesteps(total_timesteps)
+        is_infinite = isinstance(total_timesteps, float) and total_timesteps == math.inf
+        advice = ": for a training that a callback ends, give a large one such as 10**12" if is_infinite else ""
+        total_timesteps = as_count("total_timesteps", total_timesteps, minimum=0, advice=advice)
         check_callback("callback", callback)
         allowed = "a number of episodes other than 0, or None to write no log"
         is_interval = log_interval is None or (isinstance(log_interval, Real) and log_interval != 0)
@@ -128,21 +130,6 @@ def check_holds(algorithm: type[OffPolicyAlgorithm], saved: SavedModel) -> None:
         found, remedy = "with the attribute `agents`", "load a population by `sb3_cgp.population.Population.load(path)`"
     allowed = f"of {algorithm.__name__}, which {'trains a population' if takes_population else 'is a single agent'}: {remedy}"
     require(False, "path", f"a file {found}", allowed)
-
-
-def as_total_timesteps(value: Any) -> int:
-    """
-    Return the number of environment steps of a training as an integer.
-
-    :param value: the argument of ``learn``
-    :return: the number
-    :raises ValueError: if the value is no integer >= 0, nor a float equal to one, which SB3 takes too
-    """
-    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
-    is_infinite = number == math.inf
-    remedy = ": for a training that a callback ends, give a large one such as 10**12" if is_infinite else ""
-    require(number >= 0 and number % 1 == 0, "total_timesteps", value, f"an integer >= 0{remedy}")
-    return int(value)
 
 
 def check_callback(name: str, value: Any) -> None:
