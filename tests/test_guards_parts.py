@@ -4,10 +4,13 @@ import copy
 
 import numpy as np
 import pytest
+import torch as th
 from guarded import SMALL, GuardedTD3, Located, located
 from gymnasium import spaces
-from stable_baselines3.common.buffers import DictReplayBuffer
+from stable_baselines3 import TD3
+from stable_baselines3.common.buffers import BaseBuffer, DictReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
@@ -254,3 +257,29 @@ def test_hindsight_asks_the_environment_that_was_set_last():
     copied = copy.deepcopy(model)
     copied.learn(10, reset_num_timesteps=False)
     assert copied.replay_buffer.env is copied.env
+
+
+class Listing(BaseBuffer):
+    """Stores transitions in a list, and has no array of SB3's."""
+
+    def __init__(self, *args, optimize_memory_usage=False, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.transitions = []
+
+    def add(self, obs, next_obs, action, reward, done, infos):
+        self.transitions.append([th.as_tensor(each, dtype=th.float32) for each in (obs, action, next_obs, done, reward)])
+        self.pos += 1
+
+    def _get_samples(self, batch_inds, env=None):
+        fields = zip(*(self.transitions[index] for index in batch_inds), strict=True)
+        observations, actions, next_observations, dones, rewards = map(th.stack, fields)
+        return ReplayBufferSamples(observations[:, 0], actions[:, 0], next_observations[:, 0], dones, rewards)
+
+
+@pytest.mark.parametrize("algorithm", [TD3, GuardedTD3, CGP])
+def test_a_buffer_that_stores_in_its_own_way_is_trained_on_again_and_again(algorithm):
+    model = algorithm("MlpPolicy", located(), replay_buffer_class=Listing, **SMALL).learn(20)
+    model.learn(20)
+    model.learn(20, reset_num_timesteps=False)
+    assert len(model.replay_buffer.transitions) == 60
+    assert model._n_updates == 14 + 14 + 20

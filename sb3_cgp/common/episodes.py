@@ -6,6 +6,18 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 
+def stores_rows(buffer: ReplayBuffer) -> bool:
+    """
+    Return whether a replay buffer stores transitions as SB3's do, which a user's own class need not.
+
+    :param buffer: the replay buffer
+    :return: whether it has SB3's arrays
+    """
+    saves_memory = getattr(buffer, "optimize_memory_usage", False)
+    names = ("observations", "dones") if saves_memory else ("next_observations", "dones", "timeouts")
+    return all(hasattr(buffer, name) for name in names)
+
+
 def end_last_episode(buffer: ReplayBuffer) -> None:
     """
     Mark the episodes that the last row belongs to as truncated after it.
@@ -13,11 +25,11 @@ def end_last_episode(buffer: ReplayBuffer) -> None:
     Buffers that look beyond a row (n-step returns, hindsight goals, the memory-efficient variant) would otherwise take the
     next stored row for its continuation. Sampled one-step transitions stay the same, except in the memory-efficient buffer,
     which overwrites the last next observation. That row becomes a termination, as SB3's own remedy makes it (SB3 issue #46).
-    Calling this again has no effect.
+    Calling this again has no effect. A buffer of the user's own that stores otherwise is left as it is.
 
     :param buffer: the replay buffer, which may be empty
     """
-    if buffer.size() == 0:
+    if buffer.size() == 0 or not stores_rows(buffer):
         return
     if isinstance(buffer, HerReplayBuffer):
         with warnings.catch_warnings():

@@ -10,6 +10,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 
+from sb3_cgp.common.episodes import stores_rows
 from sb3_cgp.common.spaces import by_key
 
 
@@ -86,7 +87,7 @@ def continues_last_episode(buffer: ReplayBuffer, observations: Any) -> bool:
     :param observations: the observations of all N environments, not normalised, (N, *shape), by key for ``Dict`` spaces
     :return: whether each episode that has not ended in the buffer's last row goes on from the observation stored there
     """
-    if buffer.size() == 0 or buffer.n_envs != count_envs(observations):
+    if buffer.size() == 0 or not stores_rows(buffer) or buffer.n_envs != count_envs(observations):
         return False
     goes_on = _array(buffer.dones[buffer.pos - 1]) == 0
     stored, row = (
