@@ -217,3 +217,20 @@ def test_hindsight_without_a_whole_episode_says_why_and_what_to_do(arguments, me
 def test_the_remedies_for_hindsight_work(arguments):
     arguments = dict(length=9) | arguments
     assert hindsight(**arguments).learn(70)._n_updates > 0
+
+
+def test_hindsight_that_goes_on_without_its_replay_buffer_is_told_to_load_it(tmp_path):
+    arguments = dict(length=9, n_envs=2)
+    model = hindsight(**arguments, learning_starts=20).learn(60)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    env = located(2, goals=True, length=9)
+    loaded = GuardedTD3.load(tmp_path / "model", env)
+    message = r"it has 1 steps of each.*`model.load_replay_buffer\(path\)`, or raise it to 60 \+ 2 x the longest episode"
+    with pytest.raises(ValueError, match=message):
+        loaded.learn(40, reset_num_timesteps=False)
+    # Both remedies work
+    loaded = GuardedTD3.load(tmp_path / "model", env)
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    loaded.learn(40, reset_num_timesteps=False)
+    GuardedTD3.load(tmp_path / "model", env, learning_starts=60 + 2 * 9).learn(40, reset_num_timesteps=False)

@@ -94,7 +94,7 @@ def explain(error: Exception, model: OffPolicyAlgorithm) -> str | None:
     if reward is not None:
         return f"The environment returned a reward that is not a number at environment step {model.num_timesteps}{reward}."
     if frame.f_code is HerReplayBuffer.sample.__code__ and isinstance(error, RuntimeError):
-        return _explain_no_episode(frame.f_locals["self"], model.learning_starts)
+        return _explain_no_episode(frame.f_locals["self"], model)
     # Not an error of the environment's own code, but of its callers: SB3, Gymnasium, this package, and wrappers of any package
     is_caller = frame.f_globals.get("__name__", "").startswith(("stable_baselines3.", "gymnasium.", "sb3_cgp.guards."))
     if is_caller or isinstance(frame.f_locals.get("self"), gym.Wrapper):
@@ -125,7 +125,7 @@ def _explain_old_api(error: str, line: str) -> str | None:
     return None
 
 
-def _explain_no_episode(buffer: HerReplayBuffer, learning_starts: int) -> str:
+def _explain_no_episode(buffer: HerReplayBuffer, model: OffPolicyAlgorithm) -> str:
     """Explain why a hindsight replay buffer has no whole episode to sample from."""
     cause = (
         f"The HerReplayBuffer holds no whole episode of any of the {buffer.n_envs} environment(s), and samples from whole ones"
@@ -136,7 +136,14 @@ def _explain_no_episode(buffer: HerReplayBuffer, learning_starts: int) -> str:
             f"one overwrites it. Raise `buffer_size`, which the environments share, to {2 * buffer.n_envs} x the longest "
             "episode or more, or limit the episodes' length (`max_episode_steps`)."
         )
+    # The steps of a model that goes on without the replay buffer that it had
+    n_before = model.num_timesteps - buffer.pos * buffer.n_envs
+    remedy, start = "raise it to", ""
+    if n_before > 0:
+        remedy = "load the buffer that was saved with the model, `model.load_replay_buffer(path)`, or raise it to"
+        start = f"{n_before} + "
     return (
-        f"{cause}: it has {buffer.pos} steps of each, and the first episode is longer. `learning_starts` is {learning_starts} "
-        f"and counts the steps of all environments: raise it to {buffer.n_envs} x the longest episode or more."
+        f"{cause}: it has {buffer.pos} steps of each, and the first episode is longer. `learning_starts` is "
+        f"{model.learning_starts} and counts the steps of all environments: {remedy} {start}{buffer.n_envs} x the longest "
+        "episode or more."
     )
