@@ -216,3 +216,21 @@ def test_a_misspelt_policy_is_refused_with_the_nearest_name(algorithm):
 def test_a_policy_that_is_no_class_is_refused(algorithm):
     with pytest.raises(ValueError, match="`policy` is 5, but must be a class of policies, or one of 'MlpPolicy', 'CnnPolicy'"):
         algorithm(5, "Pendulum-v1")
+
+
+@pytest.mark.parametrize("algorithm", [CGP, GuardedTD3])
+@pytest.mark.parametrize(("value", "n_updates"), [(4, 5), ((10, "step"), 2), ((1, "episode"), 3)])
+def test_train_freq_that_is_set_on_a_model_takes_effect(algorithm, value, n_updates):
+    model = algorithm("MlpPolicy", located(), **SMALL | dict(learning_starts=0, gradient_steps=1)).learn(3)
+    n_before = model._n_updates
+    model.train_freq = value
+    assert model.learn(20)._n_updates - n_before == n_updates
+
+
+@pytest.mark.parametrize("value", [0, 4.0, (4, "minutes"), "episode", (1, "episode")])
+def test_a_wrong_train_freq_that_is_set_on_a_model_is_refused_by_name(value):
+    model = GuardedTD3("MlpPolicy", located(2), **SMALL)
+    model.train_freq = value
+    with pytest.raises(ValueError, match=re.escape(f"The value of `train_freq` is {value!r}")):
+        model.learn(20)
+    assert model.num_timesteps == 0

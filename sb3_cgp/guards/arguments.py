@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_cgp.common.load_arguments import SavedModel, check_load_arguments, misspelt_custom_objects, saved_attribute_names
 from sb3_cgp.common.rules import as_count, require
-from sb3_cgp.common.sb3_arguments import constructor_argument_names
+from sb3_cgp.common.sb3_arguments import check_train_freq, constructor_argument_names
 from sb3_cgp.guards.construction import check_constructor_arguments
 
 SelfArgumentGuard = TypeVar("SelfArgumentGuard", bound="ArgumentGuard")
@@ -57,6 +57,9 @@ class ArgumentGuard(OffPolicyAlgorithm):
         advice = ": for a training that a callback ends, give a large one such as 10**12" if is_infinite else ""
         total_timesteps = as_count("total_timesteps", total_timesteps, minimum=0, advice=advice)
         check_callback("callback", callback)
+        # It may have been set on the model. SB3 converts it when the model is made, by this private method, and not again.
+        check_train_freq(self.train_freq, self.n_envs)
+        self._convert_train_freq()
         allowed = "a number of episodes other than 0, or None to write no log"
         is_interval = log_interval is None or (isinstance(log_interval, Real) and log_interval != 0)
         require(is_interval, "log_interval", log_interval, allowed)
