@@ -16,7 +16,7 @@ from sb3_cgp.guards.transitions import TransitionGuard
 from sb3_cgp.guards.workers import WorkerGuard
 
 
-class GuardedAlgorithm(
+class CommonGuards(
     PathGuard,
     ConstructionGuard,
     ArgumentGuard,
@@ -24,13 +24,19 @@ class GuardedAlgorithm(
     WorkerGuard,
     ExplanationGuard,
     DummyVecEnvGuard,
-    NormalisationGuard,
     PartsGuard,
     # Before EpisodeGuard, whose `_setup_learn` resets the environment: the first observations are checked after that
     TransitionGuard,
     EpisodeGuard,
-    NetworkGuard,
     LearningStartsGuard,
+):
+    """The guards that populations have too, whose agents have tried their networks one by one, and no ``VecNormalize``."""
+
+
+class GuardedAlgorithm(
+    CommonGuards,
+    NormalisationGuard,
+    NetworkGuard,
     # Last, so that CGP can list it again after CudaGraphAlgorithm, whose `_descend` has to come first
     LossGuard,
 ):

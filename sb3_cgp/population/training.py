@@ -12,38 +12,14 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_cgp.fast.cuda_graphs import RecordedFunction, Tensors, has_cuda_graphs
 from sb3_cgp.fast.recorded_optimizers import CHECK_INTERVAL, LOSSES
 from sb3_cgp.fast.replay import LeanReplayAlgorithm
-from sb3_cgp.guards.arguments import ArgumentGuard
-from sb3_cgp.guards.construction import ConstructionGuard
-from sb3_cgp.guards.dummy_vec_env import DummyVecEnvGuard
-from sb3_cgp.guards.episodes import EpisodeGuard
-from sb3_cgp.guards.explanations import ExplanationGuard
-from sb3_cgp.guards.learning_starts import LearningStartsGuard
-from sb3_cgp.guards.parts import PartsGuard
-from sb3_cgp.guards.paths import PathGuard
-from sb3_cgp.guards.seeds import SeedGuard
-from sb3_cgp.guards.transitions import TransitionGuard
-from sb3_cgp.guards.workers import WorkerGuard
+from sb3_cgp.guards.algorithm import CommonGuards
 from sb3_cgp.population.agents import Arguments, value_of
 from sb3_cgp.population.gradient_step import AgentNumbers, GradientStep
 from sb3_cgp.population.policies import PopulationPolicy, SelectFunction
 from sb3_cgp.population.replay import sample_columns
 
 
-class PopulationTraining(
-    # CGP's guards, but for those of networks, losses and VecNormalize: each agent's own CGP has tried its networks
-    PathGuard,
-    ConstructionGuard,
-    ArgumentGuard,
-    SeedGuard,
-    WorkerGuard,
-    ExplanationGuard,
-    DummyVecEnvGuard,
-    PartsGuard,
-    TransitionGuard,
-    EpisodeGuard,
-    LearningStartsGuard,
-    LeanReplayAlgorithm,
-):
+class PopulationTraining(CommonGuards, LeanReplayAlgorithm):
     """
     The part of :class:`~sb3_cgp.population.algorithm.Population` that trains: what an agent does in ``core/cgp.py``, for all.
     """
