@@ -17,9 +17,7 @@ from sb3_cgp.common.rules import require, require_choice, require_count
 from sb3_cgp.export.boxes import ObservationSpace, take_fields
 
 FORMAT = "sb3-cgp policy"
-# Version 1 had no Dict observations, and no keys of what is normalised
-FORMAT_VERSION = 2
-READABLE_VERSIONS = (1, FORMAT_VERSION)
+FORMAT_VERSION = 1
 ONNX_FILE, TENSORS_FILE, DESCRIPTION_FILE = "policy.onnx", "policy.safetensors", "policy.json"
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
@@ -44,9 +42,8 @@ def check_description(description: Any) -> None:
     keys = ("format", "format_version", "versions", "observation_space", "action_space", "network", "inference")
     kind, version, versions, *_, inference, _, sha256 = take_fields(description, "policy", (*keys, "normalization", "sha256"))
     require(kind == FORMAT, "format", kind, repr(FORMAT))
-    is_known = type(version) is int and version in READABLE_VERSIONS
-    allowed = f"{' or '.join(map(str, READABLE_VERSIONS))} for this version of sb3-cgp; a newer one may read it"
-    require(is_known, "format_version", version, allowed)
+    is_known = type(version) is int and version == FORMAT_VERSION
+    require(is_known, "format_version", version, f"{FORMAT_VERSION} for this version of sb3-cgp; a newer one may read it")
     for name, value, names in (
         ("versions", versions, ("sb3_cgp", "torch")),
         ("sha256", sha256, (ONNX_FILE, TENSORS_FILE)),

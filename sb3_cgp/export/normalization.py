@@ -56,24 +56,21 @@ def statistics_names(space: ObservationSpace, name: str) -> tuple[str, str]:
     return (f"{MEAN}.{name}", f"{VARIANCE}.{name}") if isinstance(space, spaces.Dict) else (MEAN, VARIANCE)
 
 
-def normalized_names(normalization: Any, space: ObservationSpace, version: int) -> list[str]:
+def normalized_names(normalization: Any, space: ObservationSpace) -> list[str]:
     """
     Check the description of the normalisation.
 
     :param normalization: the description; None where no observations are normalised
     :param space: the observation space
-    :param version: the version of the format; version 1 has no keys
     :return: the names of the ONNX inputs that are normalised
     :raises ValueError: naming an entry that is not allowed
     """
     if normalization is None:
         return []
-    fields = ("epsilon", "clip_obs") if version == 1 else ("epsilon", "clip_obs", "keys")
-    epsilon, clip_obs, *others = take_fields(normalization, "normalization", fields)
+    epsilon, clip_obs, keys = take_fields(normalization, "normalization", ("epsilon", "clip_obs", "keys"))
     require_number("epsilon", epsilon)
     if clip_obs is not None:
         require_number("clip_obs", clip_obs)
-    keys: Any = others[0] if others else None
     names = list(boxes_of(space))
     if not isinstance(space, spaces.Dict):
         require(keys is None, "normalization.keys", keys, "null for observations without keys")

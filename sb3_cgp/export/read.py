@@ -54,7 +54,7 @@ def build(description: Mapping[str, Any], tensors: Mapping[str, th.Tensor]) -> E
     check_action_space(action_space)
     actor = make_actor(description["network"], observation_space, action_space)
     normalization = description["normalization"]
-    normalized = normalized_names(normalization, observation_space, description["format_version"])
+    normalized = normalized_names(normalization, observation_space)
     expected: dict[str, th.Tensor] = {}
     for name in normalized:
         statistics = th.empty(boxes_of(observation_space)[name].shape, dtype=th.float64, device="meta")
