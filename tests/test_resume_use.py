@@ -7,7 +7,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import Reach
+from environments import Doubles, Reach
 from stable_baselines3 import TD3, HerReplayBuffer
 from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -69,6 +69,60 @@ def test_a_training_that_ended_in_the_middle_of_a_step_leaves_the_last_whole_one
     stop._on_step = lambda: stop.num_timesteps < 47
     training.make_model().learn(90, callback=[TrainingCheckpointCallback(10, tmp_path / "state"), stop])
     assert CGP.resume(tmp_path / "state", training.make_env(1)).num_timesteps == 40
+
+
+class GlobalDoubles(Doubles):
+    """Draws from NumPy's global generator."""
+
+    def observe(self):
+        return np.random.normal(size=3)  # noqa: NPY002
+
+
+class WithoutSeed(DummyVecEnv):
+    """Has no method ``seed``, as those of some packages."""
+
+    @property
+    def seed(self):
+        raise AttributeError("seed", name="seed", obj=self)
+
+
+@pytest.mark.parametrize("seed", [None, 0])
+@pytest.mark.parametrize(
+    ("environment", "kind", "n_envs"),
+    [(Doubles, DummyVecEnv, 1), (Doubles, DummyVecEnv, 3), (GlobalDoubles, DummyVecEnv, 1), (GlobalDoubles, WithoutSeed, 1)],
+)
+@pytest.mark.filterwarnings("ignore:The environment's state", "ignore:.*has no method `seed`")
+def test_each_resumption_begins_new_episodes_that_follow_from_its_step(environment, kind, n_envs, seed, tmp_path):
+    begun = []
+
+    class Recording(kind):
+        def reset(self):
+            observations = super().reset()
+            begun.append(observations.copy())
+            return observations
+
+    def make():
+        made = Recording([environment] * n_envs)
+        if kind is DummyVecEnv:
+            made.seed(1)
+        begun.clear()
+        return made
+
+    def resume(steps):
+        made = make()
+        CGP.resume(tmp_path / "state", made).learn(steps)
+        return begun[0]
+
+    model = CGP("MlpPolicy", make(), policy_kwargs=dict(net_arch=[4]), **(SMALL | dict(seed=seed)))
+    model.learn(12, TrainingCheckpointCallback(3, tmp_path / "state"))
+    del model
+    shutil.copytree(tmp_path / "state", tmp_path / "copy")
+    starts = [begun[0], resume(24), resume(36)]
+    # No environment begins as another one, or as another time
+    assert len(np.unique(np.concatenate(starts), axis=0)) == 3 * n_envs
+    shutil.rmtree(tmp_path / "state")
+    (tmp_path / "copy").rename(tmp_path / "state")
+    np.testing.assert_array_equal(resume(24), starts[1])
 
 
 @pytest.mark.parametrize(

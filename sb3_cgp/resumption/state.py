@@ -8,12 +8,14 @@ A state is a tree of plain data, arrays and tensors (:mod:`sb3_cgp.resumption.en
 import io
 import random
 import warnings
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.utils import set_random_seed
 
 from sb3_cgp.common.episodes import end_last_episode
 from sb3_cgp.common.rules import require
@@ -85,7 +87,8 @@ def restore(model: ResumableModel, callback: BaseCallback, state: State) -> None
 
 def begin_new_episode(model: ResumableModel, state: State) -> None:
     """
-    Prepare a training whose environment cannot be restored to continue at the start of a new episode.
+    Prepare a training whose environment cannot be restored to continue at the start of a new episode, with random numbers that
+    follow from the seed and the step.
 
     :param model: the model, whose environment is about to be reset
     :param state: the state
@@ -95,6 +98,14 @@ def begin_new_episode(model: ResumableModel, state: State) -> None:
         "new episode, and its results will differ from those of an uninterrupted training.",
         stacklevel=2,
     )
+    # By the seed itself, as `load` sets it, each resumption would repeat the training's first episodes
+    seed = int(np.random.SeedSequence((model.seed or 0, model.num_timesteps)).generate_state(1)[0])
+    # For environments that draw from the global generators
+    set_random_seed(seed)
+    assert model.env is not None
+    # Vectorised environments of other packages may have no such method
+    with suppress(AttributeError):
+        model.env.seed(seed)
     model._last_obs = None
     end_last_episode(model._ensure_replay_buffer())
     normalizer = model.get_vec_normalize_env()
