@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 import torch as th
+from environments import Reach
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -21,6 +22,7 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnMaxEpisodes,
 )
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_cgp import CGP, HParamsCallback, TrainingCheckpointCallback
 from sb3_cgp.resumption.fingerprints import fingerprint
@@ -286,6 +288,16 @@ def test_declared_states_may_be_anything_that_is_plain_data(tmp_path):
         CGP("MlpPolicy", "Pendulum-v1", **TINY).learn(
             20, [Random({"other": object()}), TrainingCheckpointCallback(10, tmp_path / "other")]
         )
+
+
+def test_the_state_of_each_environment_is_computed_once_for_a_state_of_the_training(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(Reach, "get_training_state", lambda self: calls.append(id(self)) or {"place": 0.0})
+    training, evaluation = (DummyVecEnv([Reach]) for _ in range(2))
+    callbacks = [EvalCallback(evaluation, eval_freq=99, verbose=0), TrainingCheckpointCallback(10, tmp_path / "state")]
+    CGP("MultiInputPolicy", training, **TINY).learn(20, callbacks)
+    # A state after 10 steps, and one at the end
+    assert sorted(calls) == sorted([id(training.envs[0]), id(evaluation.envs[0])] * 2)
 
 
 def test_another_evaluation_environment_is_warned_of_by_its_callback(tmp_path):

@@ -19,7 +19,7 @@ from trainings import Training, assert_same, fingerprint
 
 from sb3_cgp import RestorableEnv, register_restorable
 from sb3_cgp.resumption import declarations
-from sb3_cgp.resumption.environments import environment_state, restore_environment, why_not_restorable
+from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
 
 
 class Foreign(Doubles):
@@ -82,8 +82,8 @@ def make(environment, seed, n_envs=2, **kwargs):
 @pytest.mark.parametrize("wrapper_class", [None, lambda env: gym.wrappers.TimeLimit(gym.wrappers.ClipAction(env), 4)])
 def test_a_declared_class_and_its_subclasses_go_on_to_the_bit(environment, wrapper_class):
     make_wrapped = partial(make, environment, wrapper_class=wrapper_class)
-    assert "is unknown and has no get_training_state(): it needs" in why_not_restorable(make_wrapped(1))
-    assert "sb3_cgp.register_restorable" in why_not_restorable(make_wrapped(1))
+    assert "is unknown and has no get_training_state(): it needs" in " ".join(obstacles(make_wrapped(1)))
+    assert "sb3_cgp.register_restorable" in " ".join(obstacles(make_wrapped(1)))
     register_restorable(Foreign, get_position, set_position)
     check(make_wrapped, steps=13, then=22)
 
@@ -92,7 +92,7 @@ def test_a_class_that_is_declared_by_its_attributes_goes_on_to_the_bit():
     register_restorable(Plain)
     check(partial(make, Plain), steps=13, then=22)
     register_restorable(Foreign)
-    assert "Foreign.simulator is namespace(position=0.0), which is not plain data" in why_not_restorable(make(Foreign, 1))
+    assert "Foreign.simulator is namespace(position=0.0), which is not plain data" in " ".join(obstacles(make(Foreign, 1)))
 
 
 def test_a_declared_wrapper_goes_on_to_the_bit():
@@ -127,7 +127,7 @@ def test_the_nearest_class_decides():
 
 def test_what_a_function_returns_is_checked():
     register_restorable(Foreign, lambda env: None, set_position)
-    reason = why_not_restorable(make(Foreign, 1))
+    reason = " ".join(obstacles(make(Foreign, 1)))
     assert reason.endswith("Foreign: the function `get` that register_restorable was given returned None.")
     register_restorable(Foreign, lambda env: env.simulator, set_position)
     with pytest.raises(ValueError, match=r"Foreign: the function `get` .* returned namespace.* must return plain data"):
@@ -171,7 +171,7 @@ def test_declarations_reach_processes_that_were_started_before(start_method):
     subprocesses = dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method=start_method))
     env = make(Local, 1, n_envs=1, wrapper_class=RestorableEnv, **subprocesses)
     try:
-        assert "Local is unknown and has no get_training_state()" in why_not_restorable(env)
+        assert "Local is unknown and has no get_training_state()" in " ".join(obstacles(env))
         register_restorable(Local, lambda env: get_position(env), lambda env, state: set_position(env, state))
         state = environment_state(start(env, 7))
         expected = go_on(env, 12)
@@ -188,10 +188,10 @@ def test_what_cannot_be_sent_to_a_process_is_named():
         Foreign, 1, n_envs=1, wrapper_class=RestorableEnv, vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork")
     )
     try:
-        assert "What Foreign was declared with cannot be sent to a process" in why_not_restorable(env)
+        assert "What Foreign was declared with cannot be sent to a process" in " ".join(obstacles(env))
         declarations._declared.clear()
         register_restorable(Foreign, lambda env: 1 / 0, set_position)
-        assert why_not_restorable(env) == "ZeroDivisionError: division by zero"
+        assert obstacles(env) == ["ZeroDivisionError: division by zero"]
         env.reset()
     finally:
         env.close()
@@ -204,7 +204,7 @@ def test_the_remedy_for_a_declared_environment_without_restorable_env_is_this_wr
         register_restorable(Foreign, get_position, set_position)
     try:
         env = make("Foreign-v0", 1, n_envs=1, vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))
-        reason = why_not_restorable(env)
+        reason = " ".join(obstacles(env))
         env.close()
     finally:
         gym.registry.pop("Foreign-v0", None)
@@ -238,7 +238,7 @@ def test_any_environment_of_gymnasiums_mujoco_goes_on_to_the_bit():
 def test_an_environment_of_gymnasiums_mujoco_that_holds_more_is_refused_by_name():
     env = make(Randomised, 1, n_envs=1)
     env.envs[0].unwrapped.planner = object()
-    assert "Randomised.planner is <object object" in why_not_restorable(env)
+    assert "Randomised.planner is <object object" in " ".join(obstacles(env))
 
 
 BOX = """
@@ -323,9 +323,9 @@ def test_tasks_that_step_as_dm_controls_do_go_on_to_the_bit():
 def test_tasks_of_dm_control_that_hold_more_are_not_restorable(monkeypatch):
     env = make(Shimmy, 1, n_envs=1)
     inner = env.envs[0].unwrapped._env
-    assert why_not_restorable(env) is None
+    assert obstacles(env) == []
     inner.task.planner = object()
-    assert "DmControlCompatibilityV0: sb3_cgp.resumption.dm_control.get_state() returned None." in why_not_restorable(env)
+    assert "DmControlCompatibilityV0: sb3_cgp.resumption.dm_control.get_state() returned None." in " ".join(obstacles(env))
     del inner.task.planner
     monkeypatch.setattr(ControlEnvironment, "__module__", "dm_control.composer.environment")
     assert environment_state(env) is None

@@ -13,7 +13,7 @@ from environments import Doubles
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecExtractDictObs, VecFrameStack, VecNormalize, VecTransposeImage
 
-from sb3_cgp.resumption.environments import environment_state, restore_environment, why_not_restorable
+from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
 
 
 class Goal(Doubles):
@@ -72,7 +72,7 @@ def test_users_environments_that_take_part_go_on_to_the_bit(wrap):
 
 def test_users_environments_and_wrappers_that_do_not_take_part_are_not_restorable():
     assert environment_state(make_goal(1, Inherits)) is None
-    assert "Inherits is unknown and has no get_training_state()" in why_not_restorable(make_goal(1, Inherits))
+    assert "Inherits is unknown and has no get_training_state()" in " ".join(obstacles(make_goal(1, Inherits)))
     assert environment_state(PENDULUM(1, wrapper_class=type("Wrapper", (gym.Wrapper,), {}))) is None
     assert environment_state(type("Wrapper", (VecNormalize,), {})(PENDULUM(1))) is None
     with pytest.raises(ValueError, match=r"`env` is .*, but must be restorable"):
@@ -84,7 +84,7 @@ def test_state_that_is_no_plain_data_is_noticed():
     assert environment_state(env) is not None
     env.envs[1].unwrapped.goal = SimpleNamespace()
     assert environment_state(env) is None
-    assert re.fullmatch(r".*PendulumEnv\.goal is namespace\(\), which is not plain data\.", why_not_restorable(env))
+    assert re.fullmatch(r".*PendulumEnv\.goal is namespace\(\), which is not plain data\.", " ".join(obstacles(env)))
     env.envs[1].unwrapped.goal = env.action_space
     assert environment_state(env) is not None
     env.simulator = deque([object()])

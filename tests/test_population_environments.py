@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from sb3_cgp import RestorableEnv, TrainingCheckpointCallback
 from sb3_cgp.population import ChunkedSubprocVecEnv, Population, make_environments, make_population_env
 from sb3_cgp.population.processes import chunk_bounds
-from sb3_cgp.resumption.environments import environment_state, restore_environment, why_not_restorable
+from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
 
 # A forked process starts at once; the tests use no threads
 FORK = dict(start_method="fork")
@@ -240,7 +240,7 @@ def test_restored_environments_go_on_to_the_bit(closing):
     actions = np.ones((5, 1), np.float32)
     for _ in range(6):
         first.step(actions)
-    assert why_not_restorable(first) is None
+    assert obstacles(first) == []
     restore_environment(other, environment_state(first))
     # As in a SubprocVecEnv, a process does not know the infos of a reset before the state was saved
     assert_alike_for(first, other, 9, knows_resets=False)

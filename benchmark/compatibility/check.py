@@ -34,7 +34,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_cgp import CGP, TrainingCheckpointCallback
-from sb3_cgp.resumption.environments import why_not_restorable
+from sb3_cgp.resumption.environments import obstacles
 
 # Hindsight replay needs an ended episode after the random steps, hence more than 100, the length of many. The stop is within
 # an episode of 50 or 100 steps, and before the end of another.
@@ -243,7 +243,7 @@ def whole(environment: dict[str, Any], folder: Path, report: Report) -> None:
         report.write(at_stop=watch.at_stop, at_end=fingerprint(model), steps_per_second=watch.steps_per_second)
     if report.known["errors"]:
         return
-    report.write(why_not_restorable=why_not_restorable(env))
+    report.write(why_not_restorable=" ".join(obstacles(env)) or None)
     with report.doing("steps"):
         started, steps = time.process_time(), 0
         while steps < ALONE and time.process_time() - started < 3:

@@ -8,7 +8,7 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
+from sb3_cgp.resumption.environments import restore_environment, state_and_obstacles
 from sb3_cgp.resumption.fingerprints import fingerprint
 from sb3_cgp.resumption.plain_data import declared_state, from_plain, plain_attributes, set_plain_attributes
 from sb3_cgp.resumption.replay_buffers import constructor_arguments
@@ -48,9 +48,11 @@ def initial_attributes(callback: BaseCallback) -> dict[int, Fingerprints]:
     return {id(each): _fingerprints(each) | _earlier(each) for each in iter_callbacks(callback)}
 
 
-def callback_states(callback: BaseCallback, training_env: VecEnv, initial: Mapping[int, Fingerprints]) -> list[State]:
+def callback_states(
+    callback: BaseCallback, training_env: VecEnv, initial: Mapping[int, Fingerprints]
+) -> tuple[list[State], list[str]]:
     """
-    Return the states of all callbacks, and whether each has counted something since the training started.
+    Return the states of all callbacks, with whether each has counted something since the training started, and the obstacles.
 
     A callback has counted if an attribute differs from that time: one of the constructor's arguments, too, or one that is not
     plain data (:func:`~sb3_cgp.resumption.fingerprints.fingerprint`). One that declares its state has counted if this has
@@ -60,26 +62,11 @@ def callback_states(callback: BaseCallback, training_env: VecEnv, initial: Mappi
     :param callback: the training's callback
     :param training_env: the training's environment, which is not saved with a callback
     :param initial: the attributes at the training's start, by :func:`initial_attributes`
-    :return: plain data, for each callback in the order of :func:`iter_callbacks`
+    :return: plain data, for each callback in the order of :func:`iter_callbacks`; and a sentence for each part that is lost
     """
-    return [_callback_state(each, training_env, initial.get(id(each), {})) for each in iter_callbacks(callback)]
-
-
-def callback_obstacles(callback: BaseCallback, training_env: VecEnv) -> list[str]:
-    """
-    Describe the environments of callbacks whose state cannot be saved.
-
-    :param callback: the training's callback
-    :param training_env: the training's environment
-    :return: a sentence for each such environment
-    """
-    found = []
-    for each in iter_callbacks(callback):
-        for name, env in _environments(each, training_env).items():
-            problems = obstacles(env)
-            if problems:
-                found.append(f"The state of {type(each).__name__}'s `{name}` cannot be saved: {' '.join(problems)}")
-    return found
+    problems: list[str] = []
+    callbacks = iter_callbacks(callback)
+    return [_callback_state(each, training_env, initial.get(id(each), {}), problems) for each in callbacks], problems
 
 
 def restore_callbacks(callback: BaseCallback, states: list[State]) -> None:
@@ -125,9 +112,12 @@ def _restore_callback(callback: BaseCallback, state: State) -> None:
                 warnings.warn(message, stacklevel=2)
 
 
-def _callback_state(callback: BaseCallback, training_env: VecEnv, initial: Fingerprints) -> State:
-    environments = {name: environment_state(env) for name, env in _environments(callback, training_env).items()}
-    state: State = {"class": _class_name(callback), "environments": environments}
+def _callback_state(callback: BaseCallback, training_env: VecEnv, initial: Fingerprints, problems: list[str]) -> State:
+    state: State = {"class": _class_name(callback), "environments": {}}
+    for name, env in _environments(callback, training_env).items():
+        state["environments"][name], obstacles = state_and_obstacles(env)
+        if obstacles:
+            problems.append(f"The state of {type(callback).__name__}'s `{name}` cannot be saved: {' '.join(obstacles)}")
     if hasattr(callback, "get_training_state"):
         own = callback.get_training_state()
         counted = own.keys() - COMMON if isinstance(own, dict) else own is not None

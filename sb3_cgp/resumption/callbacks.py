@@ -10,7 +10,7 @@ from sb3_cgp.resumption.callback_states import initial_attributes, iter_callback
 from sb3_cgp.resumption.model import ResumableModel
 from sb3_cgp.resumption.replay_buffers import check_savable
 from sb3_cgp.resumption.signals import StopSignals, end_training
-from sb3_cgp.resumption.state import gather, restore, warn_of_unsaved
+from sb3_cgp.resumption.state import gather, restore
 from sb3_cgp.resumption.store import StateStore
 
 NO_STATE = "it has no state"
@@ -183,7 +183,6 @@ class TrainingCheckpointCallback(BaseCallback):
     def _save(self) -> None:
         settings = {"save_freq": self.save_freq, "keep": self.keep, "verbose": self.verbose}
         assert self.model.callback is not None
-        warn_of_unsaved(self.model, self.model.callback)
         state = gather(self.model, self.model.callback)
         self._store.save(self.num_timesteps, state | {"checkpoint": settings})
         self._saved_at = self.num_timesteps

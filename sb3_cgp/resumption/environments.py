@@ -78,16 +78,36 @@ class RestorableEnv(gym.Wrapper):
         np.random.set_state(state["np_random"])  # noqa: NPY002
 
 
-def environment_state(env: VecEnv) -> dict[str, Any] | None:
+def state_and_obstacles(env: VecEnv) -> tuple[dict[str, Any] | None, list[str]]:
     """
-    Copy the complete state of a vectorised environment, its wrappers and its environments.
+    Copy the complete state of a vectorised environment, its wrappers and its environments, or say why it cannot be restored.
 
     :param env: the environment, between two steps
-    :return: plain data (see :func:`~sb3_cgp.resumption.plain_data.to_plain`), or None if the environment cannot be restored
+    :return: plain data (see :func:`~sb3_cgp.resumption.plain_data.to_plain`), or None if the environment cannot be restored;
+        and a sentence or two for each obstacle, with what would help
     :raises ValueError: if a ``get_training_state()`` returns anything but plain data
     """
-    state, problems = _state(env)
-    return None if problems else state
+    problems: list[str] = []
+    layers = list(_vec_layers(env))
+    states = [layer_state(layer, problems) for layer in layers]
+    base, chains = layers[-1], []
+    if isinstance(base, DummyVecEnv):
+        chains = [_chain_state(each, problems) for each in base.envs]
+    if isinstance(base, SubprocVecEnv):
+        chains = _states_in_processes(base, problems)
+    state = {"num_envs": env.num_envs, "layers": states, "envs": chains}
+    return None if problems else state, list(dict.fromkeys(problems))
+
+
+def environment_state(env: VecEnv) -> dict[str, Any] | None:
+    """
+    Copy the state of an environment.
+
+    :param env: the environment, between two steps
+    :return: the first of the two values of :func:`state_and_obstacles`
+    :raises ValueError: if a ``get_training_state()`` returns anything but plain data
+    """
+    return state_and_obstacles(env)[0]
 
 
 def obstacles(env: VecEnv) -> list[str]:
@@ -95,21 +115,10 @@ def obstacles(env: VecEnv) -> list[str]:
     Describe what prevents an environment from being restored, and what would help.
 
     :param env: the environment, between two steps
-    :return: a sentence or two for each obstacle; none if the environment can be restored
+    :return: the second of the two values of :func:`state_and_obstacles`
     :raises ValueError: if a ``get_training_state()`` returns anything but plain data
     """
-    return list(dict.fromkeys(_state(env)[1]))
-
-
-def why_not_restorable(env: VecEnv) -> str | None:
-    """
-    Return why :func:`environment_state` returns None.
-
-    :param env: the environment, between two steps
-    :return: all obstacles, in sentences, or None if there is none
-    :raises ValueError: if a ``get_training_state()`` returns anything but plain data
-    """
-    return " ".join(obstacles(env)) or None
+    return state_and_obstacles(env)[1]
 
 
 def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
@@ -124,8 +133,9 @@ def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
     :param state: the state that :func:`environment_state` returned
     :raises ValueError: if the state is that of another environment; ``env`` is then not changed
     """
-    current, problems = _state(env)
-    require(not problems, "env", env, f"restorable: {' '.join(dict.fromkeys(problems))}")
+    current, problems = state_and_obstacles(env)
+    require(not problems, "env", env, f"restorable: {' '.join(problems)}")
+    assert current is not None
     require_same(current, state)
     warn_of_other_arguments(current, state)
     layers = list(_vec_layers(env))
@@ -137,19 +147,6 @@ def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
             base.env_method("set_chain_state", chain_state, indices=index)
         else:
             _set_chain_state(base.envs[index], chain_state)
-
-
-def _state(env: VecEnv) -> tuple[dict[str, Any], list[str]]:
-    """Copy the complete state of a vectorised environment, and list the obstacles to restoring it."""
-    problems: list[str] = []
-    layers = list(_vec_layers(env))
-    states = [layer_state(layer, problems) for layer in layers]
-    base, chains = layers[-1], []
-    if isinstance(base, DummyVecEnv):
-        chains = [_chain_state(each, problems) for each in base.envs]
-    if isinstance(base, SubprocVecEnv):
-        chains = _states_in_processes(base, problems)
-    return {"num_envs": env.num_envs, "layers": states, "envs": chains}, problems
 
 
 def _states_in_processes(env: SubprocVecEnv, problems: list[str]) -> list[Any]:

@@ -19,8 +19,8 @@ from stable_baselines3.common.utils import set_random_seed
 
 from sb3_cgp.common.episodes import end_last_episode
 from sb3_cgp.common.rules import require
-from sb3_cgp.resumption.callback_states import callback_obstacles, callback_states, restore_callbacks
-from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
+from sb3_cgp.resumption.callback_states import callback_states, restore_callbacks
+from sb3_cgp.resumption.environments import restore_environment, state_and_obstacles
 from sb3_cgp.resumption.logs import tensorboard_folder
 from sb3_cgp.resumption.model import ResumableModel, State
 from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
@@ -32,7 +32,8 @@ STATISTICS = ("obs_rms", "ret_rms")
 
 def gather(model: ResumableModel, callback: BaseCallback) -> State:
     """
-    Gather the complete state of a training, between the gradient steps of one rollout and the first step of the next.
+    Gather the complete state of a training, between the gradient steps of one rollout and the first step of the next. Warn
+    once per training of each part that cannot be saved.
 
     :param model: the model
     :param callback: the training's callbacks
@@ -44,7 +45,15 @@ def gather(model: ResumableModel, callback: BaseCallback) -> State:
     zipped = io.BytesIO()
     model.save(zipped)
     normalizer = model.get_vec_normalize_env()
-    environment = environment_state(model.env)
+    environment, obstacles = state_and_obstacles(model.env)
+    callbacks, problems = callback_states(callback, model.env, model._initial_callbacks)
+    if obstacles:
+        consequence = "A resumed training will continue at the start of a new episode, unlike an uninterrupted one."
+        problems.insert(0, f"The environment's state cannot be saved. {' '.join(obstacles)} {consequence}")
+    for message in problems:
+        if message not in model._warned_of:
+            warnings.warn(message, stacklevel=2)
+    model._warned_of |= set(problems)
     return {
         "algorithm": type(model).__name__,
         "n_envs": model.n_envs,
@@ -52,9 +61,9 @@ def gather(model: ResumableModel, callback: BaseCallback) -> State:
         "model": zipped.getvalue(),
         "replay_buffer": replay_buffer_state(model._ensure_replay_buffer()),
         "environment": environment,
-        "not_restorable": None if environment is not None else " ".join(obstacles(model.env)),
+        "not_restorable": " ".join(obstacles) or None,
         "statistics": None if normalizer is None else plain_attributes(normalizer, set(vars(normalizer)) - set(STATISTICS)),
-        "callbacks": callback_states(callback, model.env, model._initial_callbacks),
+        "callbacks": callbacks,
         "logger": _pending(model.logger),
         "log_folder": tensorboard_folder(model.logger),
         "tensorboard_log": None if model.tensorboard_log is None else str(model.tensorboard_log),
@@ -111,25 +120,6 @@ def begin_new_episode(model: ResumableModel, state: State) -> None:
     normalizer = model.get_vec_normalize_env()
     if normalizer is not None and state["statistics"] is not None:
         set_plain_attributes(normalizer, state["statistics"])
-
-
-def warn_of_unsaved(model: ResumableModel, callback: BaseCallback) -> None:
-    """
-    Warn once per training of each environment whose state cannot be saved.
-
-    :param model: the model
-    :param callback: the training's callbacks
-    """
-    assert model.env is not None
-    problems = obstacles(model.env)
-    found = callback_obstacles(callback, model.env)
-    if problems:
-        consequence = "A resumed training will continue at the start of a new episode, unlike an uninterrupted one."
-        found.insert(0, f"The environment's state cannot be saved. {' '.join(problems)} {consequence}")
-    for message in found:
-        if message not in model._warned_of:
-            warnings.warn(message, stacklevel=2)
-    model._warned_of |= set(found)
 
 
 def check_fits(model: ResumableModel, state: State) -> None:
