@@ -7,10 +7,11 @@ import warnings
 from collections import Counter, defaultdict, deque
 from dataclasses import dataclass, field
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from environments import Reach
+from environments import Doubles, Reach
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -271,6 +272,77 @@ def test_what_a_callback_has_from_an_earlier_training_is_kept(tmp_path):
     again = Watch()
     CGP.resume(tmp_path / "state", "Pendulum-v1").learn(20, again, reset_num_timesteps=False)
     assert again.found == found == {"steps": [30]}
+
+
+class Losing(BaseCallback, dict):
+    """Changes what can be saved and what cannot: objects of other classes, and its arguments."""
+
+    def __init__(self, results, patience=3):
+        BaseCallback.__init__(self)
+        self.results, self.patience = results, patience
+        self.counts, self.lengths, self.own, self.same = Counter(), defaultdict(list), defaultdict(lambda: 0), Statistics()
+        self.tensor = self.function = None
+
+    def _on_step(self):
+        self.counts["steps"] += 1
+        self.lengths["all"].append(self.num_timesteps)
+        self.own["steps"] += 1
+        self.tensor, self.function = th.ones(1), len
+        self.results.append(self.num_timesteps)
+        self.patience -= 1
+        return True
+
+
+def test_what_a_callback_has_changed_and_cannot_be_saved_is_named_once(tmp_path):
+    with pytest.warns(UserWarning, match="is not saved") as warned:
+        CGP("MlpPolicy", "Pendulum-v1", **TINY).learn(20, [Losing([]), TrainingCheckpointCallback(10, tmp_path / "state")])
+    messages = [str(each.message) for each in warned if "is not saved" in str(each.message)]
+    reasons = {message.split("`")[1]: message for message in messages}
+    assert list(reasons) == ["own", "patience", "results", "tensor"]
+    assert len(messages) == 4
+    assert "as it is a defaultdict, no plain data. A resumed" in reasons["own"]
+    assert "as it is a Tensor, no plain data. A resumed" in reasons["tensor"]
+    assert "as it is an argument of its constructor. A resumed" in reasons["patience"]
+    assert "define get_training_state() and set_training_state()." in reasons["results"]
+    again = Losing([])
+    CGP.resume(tmp_path / "state", "Pendulum-v1").learn(30, again)
+    assert (again.counts, again.lengths) == (Counter(steps=30), {"all": [*range(1, 31)]})
+    assert type(again.lengths) is defaultdict
+    # As the warning says
+    assert (again.own, again.results) == ({"steps": 10}, [*range(21, 31)])
+
+
+class Stepping(BaseCallback):
+    """Steps an environment that is not vectorised, such as one for an evaluation of its own."""
+
+    def __init__(self, env):
+        super().__init__()
+        self.env, self.seen = env, []
+
+    def _on_training_start(self):
+        self.env.reset(seed=self.model.seed)
+
+    def _on_step(self):
+        observation, *_, truncated, _ = self.env.step(self.env.action_space.sample())
+        self.seen.append(observation if not truncated else self.env.reset()[0])
+        return True
+
+
+def test_an_environment_that_is_not_vectorised_is_saved_with_its_callback(tmp_path):
+    def train(model, steps, folder):
+        callback = Stepping(gym.make("Pendulum-v1"))
+        callback.env.action_space.seed(model.num_timesteps)
+        model.learn(steps, [callback, TrainingCheckpointCallback(10, folder)])
+        return callback.seen
+
+    expected = train(CGP("MlpPolicy", "Pendulum-v1", **TINY), 70, tmp_path / "straight")
+    train(CGP("MlpPolicy", "Pendulum-v1", **TINY), 40, tmp_path / "state")
+    np.testing.assert_array_equal(train(CGP.resume(tmp_path / "state", "Pendulum-v1"), 70, tmp_path / "state"), expected)
+    callbacks = [Stepping(Doubles()), TrainingCheckpointCallback(10, tmp_path / "other")]
+    with pytest.warns(UserWarning, match=r"The state of Stepping's `env` cannot be saved: .*Doubles is unknown"):
+        CGP("MlpPolicy", "Pendulum-v1", **TINY).learn(20, callbacks)
+    with pytest.warns(UserWarning, match="Stepping's `env` was not saved: its episodes will be other ones"):
+        CGP.resume(tmp_path / "other", "Pendulum-v1").learn(30, Stepping(Doubles()))
 
 
 def test_declared_states_may_be_anything_that_is_plain_data(tmp_path):

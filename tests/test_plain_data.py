@@ -1,7 +1,7 @@
 """Values and attributes as plain data, and back."""
 
 import re
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, defaultdict, deque
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -39,12 +39,19 @@ def test_values_make_the_round_trip(value):
     assert_same(from_plain(plain), value)
 
 
-@pytest.mark.parametrize("value", [deque([1], 4), {1, 2}, frozenset({"a"}), {0: [{}]}, OrderedDict(a=1)])
+@pytest.mark.parametrize(
+    "value",
+    [
+        *(deque([1], 4), {1, 2}, frozenset({"a"}), {0: [{}]}, OrderedDict(a=1)),
+        *(Counter("abca"), Counter({2: 0, "a": -1}), defaultdict(list, {3: [1]}), defaultdict(deque, a=deque([1], 2))),
+    ],
+)
 def test_collections_keep_their_kind(value):
     again = from_plain(to_plain(value))
     assert type(again) is type(value)
     assert again == value
-    assert getattr(again, "maxlen", None) == getattr(value, "maxlen", None)
+    for name in ("maxlen", "default_factory"):
+        assert getattr(again, name, None) == getattr(value, name, None)
 
 
 @pytest.mark.parametrize(
@@ -59,6 +66,7 @@ def test_collections_keep_their_kind(value):
         np.random.RandomState(),
         SimpleNamespace(),
         len,
+        defaultdict(lambda: 0),
         type("Integer", (int,), {})(1),
         type("Mapping", (dict,), {})(),
     ],

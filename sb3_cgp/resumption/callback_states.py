@@ -3,13 +3,15 @@
 import warnings
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
+import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_cgp.resumption.declarations import METHODS
 from sb3_cgp.resumption.environments import restore_environment, state_and_obstacles
-from sb3_cgp.resumption.fingerprints import fingerprint
+from sb3_cgp.resumption.fingerprints import LEFT_OUT, fingerprint
 from sb3_cgp.resumption.plain_data import declared_state, from_plain, plain_attributes, set_plain_attributes
 from sb3_cgp.resumption.replay_buffers import constructor_arguments
 
@@ -18,8 +20,17 @@ Fingerprints = dict[str, bytes | None]
 # The attributes of every callback of SB3, which follow from the training
 COMMON = {"n_calls", "num_timesteps", "verbose", "locals", "globals", "parent"}
 
-# Of a callback that was called before the training, in place of an attribute's name
-EARLIER = ""
+
+class Start(NamedTuple):
+    """
+    A callback when the training has started.
+
+    :param attributes: fingerprints of its attributes by name
+    :param was_called: whether it has been called before, in an earlier training
+    """
+
+    attributes: Fingerprints
+    was_called: bool
 
 
 def iter_callbacks(callback: BaseCallback) -> list[BaseCallback]:
@@ -38,18 +49,18 @@ def iter_callbacks(callback: BaseCallback) -> list[BaseCallback]:
     return found
 
 
-def initial_attributes(callback: BaseCallback) -> dict[int, Fingerprints]:
+def initial_attributes(callback: BaseCallback) -> dict[int, Start]:
     """
     Return the attributes that callbacks have when a training has started, so that those that its steps change can be told.
 
     :param callback: the training's callback
-    :return: fingerprints of the attributes by name, for each callback by its ``id``
+    :return: the start of each callback by its ``id``
     """
-    return {id(each): _fingerprints(each) | _earlier(each) for each in iter_callbacks(callback)}
+    return {id(each): Start(_fingerprints(each), each.n_calls > 0) for each in iter_callbacks(callback)}
 
 
 def callback_states(
-    callback: BaseCallback, training_env: VecEnv, initial: Mapping[int, Fingerprints]
+    callback: BaseCallback, training_env: VecEnv, initial: Mapping[int, Start]
 ) -> tuple[list[State], list[str]]:
     """
     Return the states of all callbacks, with whether each has counted something since the training started, and the obstacles.
@@ -65,8 +76,9 @@ def callback_states(
     :return: plain data, for each callback in the order of :func:`iter_callbacks`; and a sentence for each part that is lost
     """
     problems: list[str] = []
-    callbacks = iter_callbacks(callback)
-    return [_callback_state(each, training_env, initial.get(id(each), {}), problems) for each in callbacks], problems
+    # One that the training was given after its start has counted
+    unknown, callbacks = Start({}, was_called=True), iter_callbacks(callback)
+    return [_callback_state(each, training_env, initial.get(id(each), unknown), problems) for each in callbacks], problems
 
 
 def restore_callbacks(callback: BaseCallback, states: list[State]) -> None:
@@ -88,8 +100,7 @@ def restore_callbacks(callback: BaseCallback, states: list[State]) -> None:
         found = present.get((name, saved[name]))
         saved[name] += 1
         if found is None:
-            # States that were saved before this was noted warn as before
-            if state["environments"] or state.get("has_counted", not name.startswith("stable_baselines3.")):
+            if state["environments"] or state["has_counted"]:
                 warnings.warn(f"A {name} was among the callbacks, and is not now: what it counted is lost.", stacklevel=2)
             continue
         _restore_callback(found, state)
@@ -104,7 +115,7 @@ def _restore_callback(callback: BaseCallback, state: State) -> None:
         if environment is None:
             message = f"The state of {state['class']}'s `{attribute}` was not saved: its episodes will be other ones."
             warnings.warn(message, stacklevel=2)
-        elif isinstance(getattr(callback, attribute, None), VecEnv):
+        elif isinstance(getattr(callback, attribute, None), VecEnv | gym.Env):
             try:
                 restore_environment(getattr(callback, attribute), environment)
             except ValueError as error:
@@ -112,7 +123,7 @@ def _restore_callback(callback: BaseCallback, state: State) -> None:
                 warnings.warn(message, stacklevel=2)
 
 
-def _callback_state(callback: BaseCallback, training_env: VecEnv, initial: Fingerprints, problems: list[str]) -> State:
+def _callback_state(callback: BaseCallback, training_env: VecEnv, start: Start, problems: list[str]) -> State:
     state: State = {"class": _class_name(callback), "environments": {}}
     for name, env in _environments(callback, training_env).items():
         state["environments"][name], obstacles = state_and_obstacles(env)
@@ -123,17 +134,21 @@ def _callback_state(callback: BaseCallback, training_env: VecEnv, initial: Finge
         counted = own.keys() - COMMON if isinstance(own, dict) else own is not None
         plain = declared_state(f"{state['class']}.get_training_state()", own)
         return state | {"own": plain, "has_counted": bool(counted)}
-    before = {name: value for name, value in initial.items() if name != EARLIER}
     now = _fingerprints(callback)
-    unchanged = {name for name, value in now.items() if value is not None and value == before.get(name)}
+    unchanged = {name for name, value in now.items() if value is not None and value == start.attributes.get(name)}
     # One that has counted in an earlier training has further values from there
-    unsaved = _unsaved(callback) | (set() if EARLIER in initial else unchanged)
-    return state | {"attributes": plain_attributes(callback, without=unsaved), "has_counted": now != before}
-
-
-def _earlier(callback: BaseCallback) -> Fingerprints:
-    """Return an entry that tells of a callback that it has been called before the training."""
-    return {EARLIER: None} if callback.n_calls > 0 else {}
+    unsaved = _unsaved(callback) | (set() if start.was_called else unchanged)
+    state["attributes"] = plain_attributes(callback, without=unsaved)
+    changed = {name for name, value in now.items() if value is not None} - unchanged
+    for name in sorted(changed - state["attributes"].keys() - state["environments"].keys()):
+        value = vars(callback)[name]
+        if not isinstance(value, LEFT_OUT):
+            reason = "an argument of its constructor" if name in unsaved else f"a {type(value).__qualname__}, no plain data"
+            problems.append(
+                f"{type(callback).__name__}'s `{name}`, which has changed in the training, is not saved, as it is {reason}. A "
+                f"resumed training begins with it as the callback is given. To save it, define {METHODS}."
+            )
+    return state | {"has_counted": now != start.attributes}
 
 
 def _fingerprints(callback: BaseCallback) -> Fingerprints:
@@ -145,8 +160,9 @@ def _unsaved(callback: BaseCallback) -> set[str]:
     return {"locals", "globals", *constructor_arguments(type(callback))}
 
 
-def _environments(callback: BaseCallback, training_env: VecEnv) -> dict[str, VecEnv]:
-    return {name: value for name, value in vars(callback).items() if isinstance(value, VecEnv) and value is not training_env}
+def _environments(callback: BaseCallback, training_env: VecEnv) -> dict[str, VecEnv | gym.Env]:
+    found = {name: value for name, value in vars(callback).items() if isinstance(value, VecEnv | gym.Env)}
+    return {name: value for name, value in found.items() if value is not training_env}
 
 
 def _class_name(thing: object) -> str:

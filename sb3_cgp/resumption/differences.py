@@ -14,7 +14,7 @@ def _describe(state: dict[str, Any]) -> str:
     vectorized, *chains = [" > ".join(layer["class"] for layer in each["layers"]) for each in (state, *state["envs"])]
     # The environments are usually all of the same classes
     inside = " | ".join(dict.fromkeys(chains)) if len(set(chains)) == 1 else " | ".join(chains)
-    return f"{state['num_envs']} x {vectorized}" + (f" > {inside}" if inside else "")
+    return f"{state['num_envs']} x {' > '.join(each for each in (vectorized, inside) if each)}"
 
 
 def _all_layers(state: dict[str, Any]) -> list[dict[str, Any]]:

@@ -78,28 +78,25 @@ class RestorableEnv(gym.Wrapper):
         np.random.set_state(state["np_random"])  # noqa: NPY002
 
 
-def state_and_obstacles(env: VecEnv) -> tuple[dict[str, Any] | None, list[str]]:
+def state_and_obstacles(env: VecEnv | gym.Env) -> tuple[dict[str, Any] | None, list[str]]:
     """
-    Copy the complete state of a vectorised environment, its wrappers and its environments, or say why it cannot be restored.
+    Copy the complete state of an environment, its wrappers and its environments, or say why it cannot be restored.
 
-    :param env: the environment, between two steps
+    :param env: the environment, vectorised or not, between two steps
     :return: plain data (see :func:`~sb3_cgp.resumption.plain_data.to_plain`), or None if the environment cannot be restored;
         and a sentence or two for each obstacle, with what would help
     :raises ValueError: if a ``get_training_state()`` returns anything but plain data
     """
     problems: list[str] = []
-    layers = list(_vec_layers(env))
+    layers, envs = _parts(env)
     states = [layer_state(layer, problems) for layer in layers]
-    base, chains = layers[-1], []
-    if isinstance(base, DummyVecEnv):
-        chains = [_chain_state(each, problems) for each in base.envs]
-    if isinstance(base, SubprocVecEnv):
-        chains = _states_in_processes(base, problems)
-    state = {"num_envs": env.num_envs, "layers": states, "envs": chains}
+    in_processes = layers and isinstance(layers[-1], SubprocVecEnv)
+    chains = _states_in_processes(layers[-1], problems) if in_processes else [_chain_state(each, problems) for each in envs]
+    state = {"num_envs": 1 if isinstance(env, gym.Env) else env.num_envs, "layers": states, "envs": chains}
     return None if problems else state, list(dict.fromkeys(problems))
 
 
-def environment_state(env: VecEnv) -> dict[str, Any] | None:
+def environment_state(env: VecEnv | gym.Env) -> dict[str, Any] | None:
     """
     Copy the state of an environment.
 
@@ -110,7 +107,7 @@ def environment_state(env: VecEnv) -> dict[str, Any] | None:
     return state_and_obstacles(env)[0]
 
 
-def obstacles(env: VecEnv) -> list[str]:
+def obstacles(env: VecEnv | gym.Env) -> list[str]:
     """
     Describe what prevents an environment from being restored, and what would help.
 
@@ -121,9 +118,9 @@ def obstacles(env: VecEnv) -> list[str]:
     return state_and_obstacles(env)[1]
 
 
-def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
+def restore_environment(env: VecEnv | gym.Env, state: dict[str, Any]) -> None:
     """
-    Restore the state of a vectorised environment in another one that was made in the same way.
+    Restore the state of an environment in another one that was made in the same way.
 
     The other environment need not have been reset. Given the same actions, both then return exactly the same observations,
     rewards, ends of episodes and infos, in this and in later episodes. Only wall-clock times differ. A warning names
@@ -138,15 +135,14 @@ def restore_environment(env: VecEnv, state: dict[str, Any]) -> None:
     assert current is not None
     require_same(current, state)
     warn_of_other_arguments(current, state)
-    layers = list(_vec_layers(env))
+    layers, envs = _parts(env)
     for layer, saved in zip(layers, state["layers"], strict=True):
         set_layer_state(layer, saved)
-    base = layers[-1]
     for index, chain_state in enumerate(state["envs"]):
-        if isinstance(base, SubprocVecEnv):
-            base.env_method("set_chain_state", chain_state, indices=index)
+        if envs:
+            _set_chain_state(envs[index], chain_state)
         else:
-            _set_chain_state(base.envs[index], chain_state)
+            layers[-1].env_method("set_chain_state", chain_state, indices=index)
 
 
 def _states_in_processes(env: SubprocVecEnv, problems: list[str]) -> list[Any]:
@@ -174,6 +170,14 @@ def _remedy_in_processes(env: SubprocVecEnv) -> str:
     if is_known(module) or is_declared or all(env.env_method("has_wrapper_attr", "get_training_state")):
         return f"{missing} Make sb3_cgp.resumption.RestorableEnv its outermost wrapper."
     return f"{missing} RestorableEnv alone would not help: {described} has no {METHODS}, which it needs as well."
+
+
+def _parts(env: VecEnv | gym.Env) -> tuple[list[Any], list[gym.Env]]:
+    """List the layers of a vectorised environment, and the environments in this process: itself if it is not vectorised."""
+    if isinstance(env, gym.Env):
+        return [], [env]
+    layers = list(_vec_layers(env))
+    return layers, layers[-1].envs if isinstance(layers[-1], DummyVecEnv) else []
 
 
 def _vec_layers(env: VecEnv) -> Iterator[Any]:

@@ -9,7 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cgp.resumption.callback_states import Fingerprints
+from sb3_cgp.resumption.callback_states import Start
 from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.signals import StopSignals
 
@@ -29,7 +29,7 @@ class ResumableModel(OffPolicyAlgorithm):
     # The callbacks of the training that is running
     callback: BaseCallback | None = None
     # The attributes of the callbacks at the training's start, by `id`
-    _initial_callbacks: Mapping[int, Fingerprints] = MappingProxyType({})
+    _initial_callbacks: Mapping[int, Start] = MappingProxyType({})
     # The loaded state, until the next `learn` has restored it
     resumption: State | None = None
     # The digests of the states' manifests in each folder that holds states of this training

@@ -1,6 +1,6 @@
 """Convert the attributes of objects to plain data, which a training state can hold without pickle, and back."""
 
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, defaultdict, deque
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -16,7 +16,9 @@ SCALARS = (type(None), bool, int, float, str, bytes)
 # The kinds of NumPy's boolean and numeric data types
 NUMERIC = "biufc"
 COLLECTIONS: dict[str, Any] = {kind.__name__: kind for kind in (deque, set, frozenset)}
-MAPPINGS: dict[str, Any] = {kind.__name__: kind for kind in (dict, OrderedDict)}
+MAPPINGS: dict[str, Any] = {kind.__name__: kind for kind in (dict, OrderedDict, Counter)}
+# What a defaultdict gives a new key
+FACTORIES: dict[str, Any] = {kind.__name__: kind for kind in (bool, int, float, str, list, tuple, dict, set, deque)}
 STATISTICS: dict[str, Any] = {
     "stable_baselines3.RunningMeanStd": RunningMeanStd,
     "gymnasium.RunningMeanStd": GymnasiumRunningMeanStd,
@@ -71,10 +73,10 @@ def to_plain(value: Any) -> Any:
     Copy a value as plain data.
 
     Plain data is ``None``, bool, int, float, str, bytes, numeric NumPy arrays and scalars, and lists, tuples and
-    dictionaries with string keys that contain only plain data. Dictionaries with other keys, OrderedDicts, deques, sets,
-    NumPy's random generators, and the running statistics of SB3 and Gymnasium are represented as dictionaries that name
-    the type. Subclasses of these types are refused, as they may hold further state. Two references to one object become
-    two copies. The state from which a generator would ``spawn`` others is not copied.
+    dictionaries with string keys that contain only plain data. Dictionaries with other keys, OrderedDicts, Counters,
+    defaultdicts of builtin types, deques, sets, NumPy's random generators, and the running statistics of SB3 and Gymnasium are
+    represented as dictionaries that name the type. Subclasses of these types are refused, as they may hold further state. Two
+    references to one object become two copies. The state from which a generator would ``spawn`` others is not copied.
 
     :param value: the value
     :return: the plain data, which shares no mutable object with the value
@@ -92,6 +94,8 @@ def to_plain(value: Any) -> Any:
         return {key: to_plain(each) for key, each in value.items()}
     if kind in MAPPINGS.values():
         return {TYPE: kind.__name__, "items": [(to_plain(key), to_plain(each)) for key, each in value.items()]}
+    if kind is defaultdict and value.default_factory in FACTORIES.values():
+        return {TYPE: kind.__name__, "factory": value.default_factory.__name__, "items": to_plain(dict(value))}
     if kind in COLLECTIONS.values():
         plain = {TYPE: kind.__name__, "items": [to_plain(each) for each in value]}
         return plain | ({"maxlen": value.maxlen} if kind is deque else {})
@@ -139,13 +143,16 @@ def from_plain(plain: Any, current: Any = None) -> Any:
         return {key: from_plain(each, _part(current, key)) for key, each in plain.items()}
     if name in MAPPINGS:
         pairs = [(from_plain(key), each) for key, each in plain["items"]]
-        return MAPPINGS[name]((key, from_plain(each, _part(current, key))) for key, each in pairs)
+        return MAPPINGS[name]({key: from_plain(each, _part(current, key)) for key, each in pairs})
+    if name == defaultdict.__name__:
+        return defaultdict(FACTORIES[plain["factory"]], from_plain(plain["items"], current))
     if name in COLLECTIONS:
         items = [from_plain(each) for each in plain["items"]]
         return deque(items, plain["maxlen"]) if name == deque.__name__ else COLLECTIONS[name](items)
     if name == np.random.Generator.__name__:
         return _generator(from_plain(plain["state"]), current)
-    require(name in STATISTICS, TYPE, name, f"one of {', '.join((*MAPPINGS, *COLLECTIONS, 'Generator', *STATISTICS))}")
+    known = (*MAPPINGS, "defaultdict", *COLLECTIONS, "Generator", *STATISTICS)
+    require(name in STATISTICS, TYPE, name, f"one of {', '.join(known)}")
     statistics = current if type(current) is STATISTICS[name] else STATISTICS[name]()
     set_plain_attributes(statistics, plain["attributes"])
     return statistics

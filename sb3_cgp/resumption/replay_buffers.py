@@ -6,7 +6,6 @@ not arrays of its own lists their names in a class attribute, ``row_fields``; ea
 shape (buffer_size, n_envs, ...), that can be written to.
 """
 
-import inspect
 from collections.abc import Iterator
 from enum import Enum
 from types import FunctionType
@@ -20,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cgp.common.rules import require
+from sb3_cgp.common.sb3_arguments import constructor_argument_names
 from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
 
 State = dict[str, Any]
@@ -94,7 +94,7 @@ def constructor_arguments(cls: type) -> set[str]:
     :param cls: the class
     :return: the names
     """
-    return {name for each in cls.__mro__ if each is not object for name in inspect.signature(each).parameters}
+    return set().union(*map(constructor_argument_names, cls.__mro__))
 
 
 def _is_storage(buffer: ReplayBuffer, value: Any) -> bool:
