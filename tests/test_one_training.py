@@ -1,6 +1,7 @@
 """Folders of states that belong to one training at a time, states on other kinds of buffers, and copies of models."""
 
 import copy
+import errno
 import gc
 import os
 import pickle
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import torch as th
 from environments import Doubles
+from filelock import FileLock
 from stable_baselines3 import TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback
@@ -24,8 +26,9 @@ from trainings import SMALL, Do, Interruption, Stop, make_model
 from sb3_cgp import CGP
 from sb3_cgp.common.files import write_atomically
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer
-from sb3_cgp.resumption import FolderInUseError, TrainingCheckpointCallback, resumable
+from sb3_cgp.resumption import FolderInUseError, TrainingCheckpointCallback, locks, resumable
 from sb3_cgp.resumption.environments import obstacles
+from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.replay_buffers import fill_replay_buffer, replay_buffer_state
 
 IN_USE = r"in use by another training: process \d+ on host "
@@ -79,6 +82,27 @@ def test_another_process_is_refused_and_a_killed_one_does_not_block(folder):
     other.kill()
     other.wait()
     CGP.resume(folder, env()).learn(40)
+
+
+# Versions of filelock without the option remove a copied file
+@pytest.mark.parametrize(("has_option", "is_copied"), [(True, True), (True, False), (False, False)])
+def test_on_a_file_system_without_locks_nothing_is_left_that_blocks(has_option, is_copied, tmp_path, monkeypatch):
+    def has_none(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    if is_copied:
+        FolderLock(tmp_path).acquire()
+        gc.collect()
+        assert (tmp_path / ".lock").exists()
+    monkeypatch.setattr("fcntl.flock", has_none)
+    if not has_option:
+        monkeypatch.setattr(locks, "FileLock", lambda path, thread_local: FileLock(path, thread_local=thread_local))
+    for _ in range(2):
+        # A killed process releases nothing
+        lock = FolderLock(tmp_path)
+        with pytest.warns(UserWarning, match=r"cannot be locked \(.*\): make sure that no other process uses it"):
+            lock.acquire()
+        assert not lock._lock.is_locked
 
 
 def test_an_error_lets_go_of_the_folder(folder):
