@@ -124,13 +124,41 @@ def test_a_signal_that_an_error_left_unanswered_reaches_the_handler_from_before(
     assert seen == ["before"]
 
 
+@pytest.mark.parametrize("ends", [False, True], ids=["returns", "exits"])
+@pytest.mark.parametrize("at", [33, 40, 45], ids=["within", "last step", "policy"])
+@pytest.mark.parametrize("is_nested", [False, True], ids=["alone", "nested"])
+def test_the_handler_from_before_is_called_once_when_the_state_is_saved(is_nested, at, ends, tmp_path, handler, monkeypatch):
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
+    seen = []
+
+    def handle(number, _):
+        seen.append((number, StateStore(tmp_path / "state").load()[0]))
+        if ends:
+            raise SystemExit(7)
+
+    def train():
+        callbacks = [TrainingCheckpointCallback(10, tmp_path / "state"), Do(at, terminate)]
+        make_model(policy_training="offline").learn(40, callbacks)
+
+    outer = [TrainingCheckpointCallback(10, tmp_path / "outer"), Do(15, train)]
+    signal.signal(signal.SIGTERM, handle)
+    try:
+        with pytest.raises(SystemExit, match="7" if ends else "143"):
+            make_model().learn(30, outer) if is_nested else train()
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    assert seen == [(signal.SIGTERM, min(at, 40))]
+
+
 def test_a_second_sigterm_acts_as_before(tmp_path, handler):
     seen = []
+    reach = Do(33, lambda: seen.append(33))
     signal.signal(signal.SIGTERM, lambda *_: seen.append("before"))
     try:
         with pytest.raises(SystemExit, match="143"):
-            make_model().learn(50, [TrainingCheckpointCallback(10, tmp_path), Do(33, terminate), Do(33, terminate)])
-        assert seen == ["before"]
+            make_model().learn(50, [TrainingCheckpointCallback(10, tmp_path), Do(33, terminate), Do(33, terminate), reach])
+        # Each of the two, the second one at once
+        assert seen == ["before", 33, "before"]
     finally:
         signal.signal(signal.SIGTERM, handler)
 

@@ -274,7 +274,7 @@ class ResumableAlgorithm(ResumableModel):
         outer_callback = self.callback
         try:
             yield
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             # A terminal sends Ctrl-C to the environments' processes, too, which end by it
             if self._is_interrupted and any(isinstance(each, LOST_PROCESS) for each in (error, error.__cause__)):
                 self._stop_if_asked()

@@ -25,11 +25,11 @@ class TrainingCheckpointCallback(BaseCallback):
     offline training of a policy.
 
     On SIGTERM, which a cluster's scheduler sends, and on Ctrl-C, the state is saved when the next rollout would start. Then
-    the process exits with status 143, or ``learn`` raises ``KeyboardInterrupt``. A training without rollouts ends at its next
-    step without saving: ``learn`` has saved the state at its start, and a user's call of ``train_policy`` is to be repeated. A
-    second signal has the effect that it has without this callback. Of several such callbacks, the first one handles the
-    signals. A training within a callback of another training ends first, and saves its state; the exception then ends the
-    other one within its step, whose last state remains.
+    the process exits with status 143, or ``learn`` raises ``KeyboardInterrupt``. A handler of SIGTERM that was set before is
+    called in between. A training without rollouts ends at its next step without saving: ``learn`` has saved the state at its
+    start, and a user's call of ``train_policy`` is to be repeated. A second signal has the effect that it has without this
+    callback. Of several such callbacks, the first one handles the signals. A training within a callback of another training
+    ends first, and saves its state; the exception then ends the other one within its step, whose last state remains.
 
     One training at a time can use the folder. It is locked from ``resume``, or the start of ``learn``, until ``learn`` ends.
 
@@ -206,6 +206,7 @@ class TrainingCheckpointCallback(BaseCallback):
         number = self.noted_signal
         if number is not None:
             # An outer training's signal stays noted, for the outer one to end as well
+            self.signals.pass_on()
             self.signals.noted = None
             end_training(number, f"The training was interrupted: {self._kept_state}")
 

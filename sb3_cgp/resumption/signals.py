@@ -13,7 +13,7 @@ class StopSignals:
     """
     Note a signal that asks the process to end, so that a training can save its state before.
 
-    A second signal has the effect that it has without this object.
+    SIGTERM's own handler is called when the training ends. A second signal has the effect that it has without this object.
     """
 
     # The object of the training in progress. A training within one of its callbacks ends by what this object notes.
@@ -61,7 +61,7 @@ class StopSignals:
             StopSignals._current = None
 
     def pass_on(self) -> None:
-        """Call the handler that a noted SIGTERM had, if Python has set one: an error has ended the training before it did."""
+        """Call the handler that a noted SIGTERM had, if Python has set one, at the end of the training."""
         if self.noted == signal.SIGTERM and callable(self._noted_handler):
             self.noted = None
             self._noted_handler(signal.SIGTERM, None)
