@@ -2,6 +2,7 @@
 
 import copy
 import time
+from enum import Enum, IntEnum
 
 import numpy as np
 import pytest
@@ -27,6 +28,33 @@ def test_the_states_of_another_training_are_not_touched_by_a_resumed_one_either(
     assert StateStore(tmp_path / "other").steps() == [50, 60]
     model.learn(50, TrainingCheckpointCallback(10, tmp_path / "new"))
     assert StateStore(tmp_path / "new").load()[0] == 50
+
+
+Level = IntEnum("Level", "LOW HIGH")
+Key = Enum("Key", {"PHASE": "phase"}, type=str)
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        *((Level.HIGH, 2), (np.str_("a"), "a"), (type("Celsius", (float,), {})(3), 3.0), (Key.PHASE, "Key.PHASE")),
+        *((True, True), (np.float32(0.1), np.float32(0.1)), (np.bool_(True), np.bool_(True)), (np.float64(2), np.float64(2))),
+        *((np.datetime64("2020-01-01"), None), (object(), None)),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_pending_value_of_any_type_is_kept_or_left_out(value, expected, tmp_path):
+    def log():
+        model.logger.record(Key.PHASE, value, exclude="stdout")
+        model.logger.record_mean("other", 3.0)
+
+    model = make_model()
+    model.learn(9, [TrainingCheckpointCallback(9, tmp_path), Do(9, log)], log_interval=100)
+    kept = CGP.resume(tmp_path, make_vec_env("Pendulum-v1")).resumption["logger"]
+    found = kept["name_to_value"].get("Key.PHASE")
+    assert (found, type(found)) == (expected, type(expected))
+    assert kept["name_to_excluded"].get("Key.PHASE") == (None if expected is None else ("stdout",))
+    assert (kept["name_to_value"]["other"], kept["name_to_count"]) == (3.0, {"other": 1})
 
 
 def test_several_callbacks_save_to_folders_of_their_own(tmp_path):

@@ -23,7 +23,7 @@ from sb3_cgp.resumption.callback_states import callback_states, restore_callback
 from sb3_cgp.resumption.environments import restore_environment, state_and_obstacles
 from sb3_cgp.resumption.logs import tensorboard_folder
 from sb3_cgp.resumption.model import ResumableModel, State
-from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
+from sb3_cgp.resumption.plain_data import NUMERIC, plain_attributes, set_plain_attributes
 from sb3_cgp.resumption.replay_buffers import replay_buffer_state
 
 # VecNormalize's statistics, which outlive an episode
@@ -141,12 +141,18 @@ def check_fits(model: ResumableModel, state: State) -> None:
 
 def _pending(logger: Logger) -> State:
     """Copy the recorded numbers and strings that have not been written. Images, figures and videos are omitted."""
-    plain = {key: value for key, value in logger.name_to_value.items() if isinstance(value, (int, float, str, np.generic))}
-    return {
-        "name_to_value": plain,
-        "name_to_count": {key: logger.name_to_count[key] for key in plain if key in logger.name_to_count},
-        "name_to_excluded": {key: logger.name_to_excluded[key] for key in plain if key in logger.name_to_excluded},
-    }
+    plain = {key: _plain_logged(value) for key, value in logger.name_to_value.items()}
+    kept = [key for key, value in plain.items() if value is not None]
+    recorded = {"name_to_value": plain, "name_to_count": logger.name_to_count, "name_to_excluded": logger.name_to_excluded}
+    # Keys may be of an enumeration, too
+    return {name: {str(key): values[key] for key in kept if key in values} for name, values in recorded.items()}
+
+
+def _plain_logged(value: Any) -> Any:
+    """Return a number or string by a type of Python's or NumPy's own, which an enumeration's is not; None for other values."""
+    if isinstance(value, np.generic) and value.dtype.kind in NUMERIC:
+        return value
+    return next((kind(value) for kind in (bool, int, float, str) if isinstance(value, kind)), None)
 
 
 def _random_state(model: ResumableModel) -> dict[str, Any]:
