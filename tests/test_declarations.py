@@ -1,6 +1,7 @@
 """Environments of others that are declared restorable go on to the bit, in this process and in others."""
 
 import threading
+from collections import deque
 from functools import partial
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ from environment_states import assert_same as assert_same_values
 from environment_states import check, go_on, start
 from environments import Doubles
 from gymnasium import spaces
+from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
@@ -239,6 +241,48 @@ def test_an_environment_of_gymnasiums_mujoco_that_holds_more_is_refused_by_name(
     env = make(Randomised, 1, n_envs=1)
     env.envs[0].unwrapped.planner = object()
     assert "Randomised.planner is <object object" in " ".join(obstacles(env))
+
+
+class Delayed(HopperEnv):
+    """A user's task that takes each action a step later, and has further names of SB3's vectorised environments."""
+
+    def __init__(self, **kwargs):
+        self.actions, self.waiting, self.reset_infos = deque([np.zeros(3)], maxlen=2), 0, []
+        super().__init__(**kwargs)
+
+    def step(self, action):
+        self.actions.append(action)
+        self.waiting += 1
+        self.reset_infos = [self.waiting]
+        observation, reward, *rest = super().step(self.actions.popleft())
+        return observation, reward + self.waiting, *rest
+
+
+def test_attributes_of_a_users_environment_may_have_the_names_of_other_classes():
+    check(partial(make, Delayed, n_envs=1, wrapper_class=lambda env: gym.wrappers.TimeLimit(env, 30)), steps=44, then=70)
+    env = make(Delayed, 1, n_envs=1)
+    env.envs[0].unwrapped.reset_infos = object()
+    assert "Delayed.reset_infos is <object object" in " ".join(obstacles(env))
+
+
+class Adapter(gym.Env):
+    """Has another environment, and is no wrapper."""
+
+    def __init__(self):
+        self.env = PendulumEnv()
+        self.action_space, self.observation_space = self.env.action_space, self.env.observation_space
+
+    def reset(self, *, seed=None, options=None):
+        return self.env.reset(seed=seed)
+
+    def step(self, action):
+        return self.env.step(action)
+
+
+def test_an_environment_within_one_that_is_no_wrapper_is_an_obstacle():
+    register_restorable(Adapter)
+    (problem,) = obstacles(make(Adapter, 1, n_envs=1))
+    assert "Adapter.env is <gymnasium.envs.classic_control.pendulum.PendulumEnv" in problem
 
 
 BOX = """

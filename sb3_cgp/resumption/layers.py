@@ -1,6 +1,7 @@
 """The state of one environment or wrapper, without the environment that it wraps."""
 
 import io
+from collections.abc import Set
 from functools import partial
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
@@ -10,6 +11,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import PassiveEnvChecker
 from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
 from sb3_cgp.common.sb3_arguments import constructor_argument_names
@@ -41,19 +43,29 @@ STATELESS_TYPES = (
 )
 # MuJoCo's model does not change; its data is saved separately
 STATELESS_MODULES = ("gymnasium.envs.mujoco.mujoco_rendering.", "gymnasium_robotics.utils.mujoco_utils.", "mujoco.", "pygame.")
+# Attributes without state, by the names of the classes, or of their modules, whose objects and those of subclasses have them
+VEC_ENV = "stable_baselines3.common.vec_env."
 UNSAVED = {
     # The wrapped environments and stacks, each of which has a state of its own
-    *("env", "envs", "venv", "obs_spaces", "sub_stacked_observations"),
-    # The actions of the last completed step
-    "actions",
-    # SubprocVecEnv's connections
-    *("closed", "processes", "remotes", "waiting", "work_remotes"),
-    # Attributes of the class, and the constructor's arguments
-    *("class_attributes", "_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "fullpath"),
+    "gymnasium.core.Wrapper": {"env"},
+    f"{VEC_ENV}base_vec_env.": {"venv", "class_attributes", "metadata", "render_mode"},
+    f"{VEC_ENV}stacked_observations.": {"sub_stacked_observations"},
+    f"{VEC_ENV}vec_normalize.": {"obs_spaces"},
+    # The actions are those of the last completed step
+    f"{VEC_ENV}dummy_vec_env.": {"envs", "actions"},
+    f"{VEC_ENV}subproc_vec_env.": {"closed", "processes", "remotes", "waiting", "work_remotes"},
+    # The constructor's arguments
+    "gymnasium.utils.": {"_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs"},
+    "gymnasium.envs.mujoco.": {"fullpath"},
+    "gymnasium_robotics.": {"fullpath"},
     # Rendering, and wall-clock times
-    *("metadata", "render_mode", "frame_list", "recorded_frames", "render_history", "episode_start_time", "t_start"),
+    "gymnasium.core.Env": {"metadata", "render_mode"},
+    "gymnasium.wrappers.": {"frame_list", "recorded_frames", "render_history", "episode_start_time"},
+    f"{VEC_ENV}vec_video_recorder.": {"recorded_frames"},
+    f"{VEC_ENV}vec_monitor.": {"t_start"},
+    "stable_baselines3.common.monitor.": {"t_start"},
 }
-# The infos of the last step may hold values of any type; they are overwritten before they are read
+# SB3's infos of the last step may hold values of any type; they are overwritten before they are read
 INFOS = {"buf_infos", "reset_infos"}
 # Of a checker whose last infos are no plain data: its checks of the first two steps, which only warn, are skipped
 CHECKED = {"_previous_data": None, "checked_step": True, "checked_data_reuse": True}
@@ -83,11 +95,12 @@ def layer_state(layer: Any, problems: list[str], is_replayed: bool = False) -> d
         state["own"] = _own_state(layer, name, declaration, problems)
         state["attributes"] = plain_attributes(layer, without=vars(layer).keys() - RANDOM_STATE)
     else:
-        state["attributes"] = plain_attributes(layer, UNSAVED)
+        unsaved = _unsaved(kind)
+        state["attributes"] = plain_attributes(layer, unsaved)
         if kind is PassiveEnvChecker and "_previous_data" not in state["attributes"]:
             state["attributes"] |= CHECKED
         is_declared = declaration is not None
-        problems.extend(_problems(layer, name, state["attributes"].keys(), is_declared))
+        problems.extend(_problems(layer, name, state["attributes"].keys() | unsaved, is_declared))
     # By which a difference is noticed, as an attribute often is a value that the user gave to the constructor
     arguments = constructor_argument_names(kind)
     state["arguments"] = [key for key in state["attributes"] if key.removeprefix("_") in arguments]
@@ -146,13 +159,19 @@ def _own_state(layer: Any, name: str, declaration: Declaration, problems: list[s
     return declared_state(described, own)
 
 
-def _problems(layer: Any, name: str, saved: Any, is_declared: bool) -> list[str]:
+def _unsaved(kind: type) -> set[str]:
+    """Return the names of the attributes of a class that have no state."""
+    bases = [f"{base.__module__}.{base.__qualname__}" for base in kind.__mro__]
+    return set().union(*(names for origin, names in UNSAVED.items() if any(base.startswith(origin) for base in bases)))
+
+
+def _problems(layer: Any, name: str, handled: Set[str], is_declared: bool) -> list[str]:
     """Return a sentence for each obstacle to restoring a layer whose state is its attributes."""
     if not (is_declared or is_known(type(layer).__module__)):
         remedy = f"it needs {METHODS}, or sb3_cgp.register_restorable"
         return [f"{name} is unknown and has no get_training_state(): {remedy}."]
-    unsaved = {key: vars(layer)[key] for key in vars(layer).keys() - saved - UNSAVED - INFOS}
-    obstacles = {key: value for key, value in sorted(unsaved.items()) if not _is_stateless(value)}
+    others = {key: vars(layer)[key] for key in vars(layer).keys() - handled - (INFOS if isinstance(layer, VecEnv) else set())}
+    obstacles = {key: value for key, value in sorted(others.items()) if not _is_stateless(value)}
     return [f"{name}.{key} is {value!r}, which is not plain data." for key, value in obstacles.items()]
 
 
