@@ -21,6 +21,7 @@ from trainings import Training, assert_same, fingerprint
 
 from sb3_cgp import RestorableEnv, register_restorable
 from sb3_cgp.resumption import declarations
+from sb3_cgp.resumption.declarations import METHODS
 from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
 
 
@@ -263,6 +264,27 @@ def test_attributes_of_a_users_environment_may_have_the_names_of_other_classes()
     env = make(Delayed, 1, n_envs=1)
     env.envs[0].unwrapped.reset_infos = object()
     assert "Delayed.reset_infos is <object object" in " ".join(obstacles(env))
+
+
+class Viewing(HopperEnv):
+    """A user's task that reads arrays which change with others."""
+
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.height, self.limits = self.data.qpos[1:2], self.init_qpos[1:]
+        # Neither of these changes with another
+        self.one, self.nothing = np.array(self.data.qvel), np.zeros(0)
+        self.same = self.one
+
+
+def test_an_array_that_shares_memory_is_an_obstacle():
+    env = make(Viewing, 1, n_envs=1)
+    height, limits = obstacles(env)
+    assert f"Viewing.height shares memory with MuJoCo's data: it has to be a copy, or the class needs {METHODS}." in height
+    assert "Viewing.limits shares memory with its init_qpos: it has to be a copy" in limits
+    task = env.envs[0].unwrapped
+    task.height, task.limits = task.height.copy(), task.limits.copy()
+    assert obstacles(env) == []
 
 
 class Adapter(gym.Env):

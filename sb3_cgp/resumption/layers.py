@@ -3,6 +3,7 @@
 import io
 from collections.abc import Set
 from functools import partial
+from itertools import combinations
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -19,6 +20,7 @@ from sb3_cgp.resumption.declarations import METHODS, OWN, Declaration, find_decl
 from sb3_cgp.resumption.mujoco_data import (
     get_mujoco_data,
     is_restorable,
+    is_view,
     model_state,
     mujoco_state,
     set_model_state,
@@ -172,7 +174,20 @@ def _problems(layer: Any, name: str, handled: Set[str], is_declared: bool) -> li
         return [f"{name} is unknown and has no get_training_state(): {remedy}."]
     others = {key: vars(layer)[key] for key in vars(layer).keys() - handled - (INFOS if isinstance(layer, VecEnv) else set())}
     obstacles = {key: value for key, value in sorted(others.items()) if not _is_stateless(value)}
-    return [f"{name}.{key} is {value!r}, which is not plain data." for key, value in obstacles.items()]
+    sentences = [f"{name}.{key} is {value!r}, which is not plain data." for key, value in obstacles.items()]
+    return sentences if is_known(type(layer).__module__) else sentences + _shared(layer, name)
+
+
+def _shared(layer: Any, name: str) -> list[str]:
+    """Return a sentence for each array that changes with another one, or with MuJoCo's data: a restored copy would not."""
+    arrays = {key: value for key, value in vars(layer).items() if isinstance(value, np.ndarray) and value.size}
+    data = get_mujoco_data(layer)
+    others = {key: "MuJoCo's data" for key, array in arrays.items() if data is not None and is_view(array, data)}
+    for (key, array), (other, view) in combinations(arrays.items(), 2):
+        if array is not view and np.shares_memory(array, view):
+            others.setdefault(other, f"its {key}")
+    remedy = f"it has to be a copy, or the class needs {METHODS}"
+    return [f"{name}.{key} shares memory with {other}: {remedy}." for key, other in others.items()]
 
 
 def _is_stateless(value: Any) -> bool:

@@ -36,6 +36,17 @@ def is_restorable(data: Any) -> bool:
     return not (model.nplugin or getattr(model, "nflex", 0) or model.opt.enableflags & int(sleep))
 
 
+def is_view(array: np.ndarray, data: Any) -> bool:
+    """
+    Return whether an array lies in the main buffer of MuJoCo's data, whose first field is ``qpos``.
+
+    :param array: the array
+    :param data: MuJoCo's data
+    """
+    offset = array.__array_interface__["data"][0] - data.qpos.__array_interface__["data"][0]
+    return 0 <= offset < data.nbuffer
+
+
 def mujoco_state(data: Any) -> dict[str, Any]:
     """
     Copy the state of a MuJoCo simulation.
@@ -101,14 +112,11 @@ def _fields(data: Any) -> Iterator[tuple[str, np.ndarray]]:
     """
     List the fields that MuJoCo steps from and that environments read before the next step, as writable arrays.
 
-    These are all fields of floats and flags in the main buffer, whose first field is ``qpos``, derived fields included.
+    These are all fields of floats and flags in the main buffer, derived fields included.
     Each step computes the indices of the main buffer and the contents of the arena, such as contacts, before it reads them;
     neither is safe to write to.
     """
-    start = data.qpos.__array_interface__["data"][0]
     for name in dir(data):
         field = None if name.startswith("_") else getattr(data, name)
-        if isinstance(field, np.ndarray) and field.size and field.dtype.kind in "fb":
-            offset = field.__array_interface__["data"][0] - start
-            if 0 <= offset < data.nbuffer:
-                yield name, field
+        if isinstance(field, np.ndarray) and field.size and field.dtype.kind in "fb" and is_view(field, data):
+            yield name, field
