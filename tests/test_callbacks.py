@@ -96,11 +96,15 @@ def test_within_another_callback_it_is_refused(nest, tmp_path):
 
 
 class Prioritised(ReplayBuffer):
-    """A buffer of somebody's own, with more to it than rows."""
+    """A buffer of somebody's own, with more to it than rows, and an argument that changes."""
 
-    def __init__(self, *args, **kwargs):
+    def __init__(self, *args, beta=0.5, **kwargs):
         super().__init__(*args, **kwargs)
-        self.priorities = np.ones(self.buffer_size)
+        self.priorities, self.beta = np.ones(self.buffer_size), beta
+
+    def add(self, *args):
+        super().add(*args)
+        self.beta += 0.25
 
 
 class Tree(Prioritised):
@@ -117,6 +121,13 @@ def test_a_replay_buffer_is_saved_with_all_of_its_state_or_refused(tmp_path):
     model.learn(30, TrainingCheckpointCallback(10, tmp_path / "plain"))
     resumed = CGP.resume(tmp_path / "plain", make_vec_env("Pendulum-v1"))
     assert np.array_equal(resumed.replay_buffer.priorities, model.replay_buffer.priorities)
+    assert resumed.replay_buffer.beta == 0.5 + 30 * 0.25
+    del resumed
+    given = CGP.resume(tmp_path / "plain", make_vec_env("Pendulum-v1"), replay_buffer_kwargs=dict(beta=2.0))
+    assert given.replay_buffer.beta == 2.0
+    del given
+    with pytest.raises(ValueError, match=r"`buffer_size` is 80, .* 150, as saved: replay_buffer.priorities .* shape \(150,\)"):
+        CGP.resume(tmp_path / "plain", make_vec_env("Pendulum-v1"), buffer_size=80)
     with pytest.raises(ValueError, match=r"`replay_buffer\.tree` is <object .*, but must be plain data or an array where"):
         make_model(replay_buffer_class=Tree).learn(30, TrainingCheckpointCallback(10, tmp_path / "tree"))
 

@@ -132,7 +132,8 @@ class ResumableAlgorithm(ResumableModel):
         check_fits(model, state)
         # Model and environment must share the space, as wrappers may draw random actions from it, too
         model.action_space = model.env.action_space
-        fill_replay_buffer(model._ensure_replay_buffer(), state.pop("replay_buffer"))
+        changed = kwargs.get("replay_buffer_kwargs") or ()
+        fill_replay_buffer(model._ensure_replay_buffer(), state.pop("replay_buffer"), changed)
         model.resumption = state | {
             "checkpoint": state["checkpoint"] | {"path": store.folder},
             # `set_env` would reset these attributes

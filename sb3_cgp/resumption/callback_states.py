@@ -9,11 +9,11 @@ import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_cgp.common.sb3_arguments import constructor_argument_names
 from sb3_cgp.resumption.declarations import METHODS
 from sb3_cgp.resumption.environments import restore_environment, state_and_obstacles
 from sb3_cgp.resumption.fingerprints import LEFT_OUT, fingerprint
 from sb3_cgp.resumption.plain_data import declared_state, from_plain, plain_attributes, set_plain_attributes
-from sb3_cgp.resumption.replay_buffers import constructor_arguments
 
 State = dict[str, Any]
 Fingerprints = dict[str, bytes | None]
@@ -157,7 +157,7 @@ def _fingerprints(callback: BaseCallback) -> Fingerprints:
 
 def _unsaved(callback: BaseCallback) -> set[str]:
     """Return the names of the attributes that a resumed training gives anew."""
-    return {"locals", "globals", *constructor_arguments(type(callback))}
+    return {"locals", "globals"}.union(*map(constructor_argument_names, type(callback).__mro__))
 
 
 def _environments(callback: BaseCallback, training_env: VecEnv) -> dict[str, VecEnv | gym.Env]:

@@ -6,7 +6,7 @@ not arrays of its own lists their names in a class attribute, ``row_fields``; ea
 shape (buffer_size, n_envs, ...), that can be written to.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from enum import Enum
 from types import FunctionType
 from typing import Any
@@ -23,6 +23,8 @@ from sb3_cgp.common.sb3_arguments import constructor_argument_names
 from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
 
 State = dict[str, Any]
+# The packages whose buffers do not change their arguments
+OURS = ("stable_baselines3.", "sb3_cgp.")
 # The types of a buffer's attributes that hold no state; its environment is saved as the model's
 STATELESS_TYPES = (Enum, FunctionType, np.dtype, spaces.Space, th.device, type, VecEnv)
 # SB3's fields, none of which refers to a row's position
@@ -44,16 +46,17 @@ def replay_buffer_state(buffer: ReplayBuffer) -> State:
         "optimize_memory_usage": buffer.optimize_memory_usage,
         "buffer_size": buffer.buffer_size,
         "rows": {path: array.numpy(force=True) if isinstance(array, th.Tensor) else array for path, array in rows.items()},
-        "attributes": plain_attributes(buffer, without={"infos", *_field_names(buffer), *constructor_arguments(type(buffer))}),
+        "attributes": plain_attributes(buffer, without={"infos", *_field_names(buffer), *_models_arguments(type(buffer))}),
     }
 
 
-def fill_replay_buffer(buffer: ReplayBuffer, state: State) -> None:
+def fill_replay_buffer(buffer: ReplayBuffer, state: State, changed: Collection[str] = ()) -> None:
     """
     Fill an empty replay buffer with the saved transitions.
 
     :param buffer: the buffer
     :param state: what :func:`replay_buffer_state` returned
+    :param changed: the names of arguments with which this buffer was made in another way, whose attributes are not restored
     :raises ValueError: if the buffer has other fields, another number of environments, or too few rows
     """
     for name in ("n_envs", "optimize_memory_usage"):
@@ -68,7 +71,8 @@ def fill_replay_buffer(buffer: ReplayBuffer, state: State) -> None:
     converted = {path: _convert(path, values, arrays[path]) for path, values in rows.items()}
     for path, values in converted.items():
         arrays[path][: len(values)] = th.from_numpy(values) if isinstance(arrays[path], th.Tensor) else values
-    set_plain_attributes(buffer, state["attributes"] | position)
+    kept = {name: value for name, value in state["attributes"].items() if name not in changed}
+    set_plain_attributes(buffer, kept | position)
 
 
 def check_savable(buffer: ReplayBuffer) -> None:
@@ -87,14 +91,9 @@ def check_savable(buffer: ReplayBuffer) -> None:
         require(is_saved, f"replay_buffer.{name}", value, "plain data or an array where the training is saved")
 
 
-def constructor_arguments(cls: type) -> set[str]:
-    """
-    Return the names of the arguments of a class's constructors, which a resumed training gives anew.
-
-    :param cls: the class
-    :return: the names
-    """
-    return set().union(*map(constructor_argument_names, cls.__mro__))
+def _models_arguments(cls: type) -> set[str]:
+    """Return the names of the arguments that the model gives anew. Those of a user's own class may change, as a weight's."""
+    return set().union(*(constructor_argument_names(base) for base in cls.__mro__ if base.__module__.startswith(OURS)))
 
 
 def _is_storage(buffer: ReplayBuffer, value: Any) -> bool:
@@ -126,6 +125,10 @@ def _fit(buffer: ReplayBuffer, state: State) -> tuple[State, State]:
     position, is_full = state["attributes"]["pos"], state["attributes"]["full"]
     if size == state["buffer_size"]:
         return rows, {}
+    arrays = {name: value for name, value in state["attributes"].items() if isinstance(value, np.ndarray)}
+    for name, array in arrays.items():
+        allowed = f"{buffer.n_envs * state['buffer_size']}, as saved: replay_buffer.{name} is of shape {array.shape}"
+        require(array.shape == np.shape(getattr(buffer, name)), "buffer_size", size * buffer.n_envs, allowed)
     n_rows = state["buffer_size"] if is_full else position
     n_envs, given = buffer.n_envs, size * buffer.n_envs
     # The buffers whose rows refer to each other need one more row
