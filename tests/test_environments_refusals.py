@@ -61,6 +61,7 @@ def test_other_arguments_of_the_environment_are_named(kwargs):
             "TimeLimit._max_episode_steps is 30, and was 20",
         ):
             assert str(warning.message).count(difference) == 1
+        assert "or that one has changed them, as by a reset" in str(warning.message)
         # The saved ones are restored
         assert other.get_attr("g") == [10.0, 10.0]
         assert other.clip_obs == 10.0

@@ -24,7 +24,7 @@ def _all_layers(state: dict[str, Any]) -> list[dict[str, Any]]:
 
 def warn_of_other_arguments(current: dict[str, Any], saved: dict[str, Any]) -> None:
     """
-    Warn of arguments of an environment and its wrappers that differ from the saved ones.
+    Warn of arguments of an environment and its wrappers that differ from the saved ones, which may have changed since.
 
     :param current: the state of the environment that is about to be changed
     :param saved: the state that is to be restored
@@ -37,8 +37,9 @@ def warn_of_other_arguments(current: dict[str, Any], saved: dict[str, Any]) -> N
                 found.append(f"{ours['class']}.{name} is {our!r}, and was {their!r}")
     if found:
         warnings.warn(
-            f"The environment was made with other arguments than the saved one: {'; '.join(dict.fromkeys(found))}. The saved "
-            "values are restored, as they are part of the training's state. To go on with others, set them in a callback.",
+            "The environment was made with other arguments than the saved one, or that one has changed them, as by a reset: "
+            f"{'; '.join(dict.fromkeys(found))}. The saved values are restored, as they are part of the training's state. To "
+            "go on with others, set them in a callback.",
             stacklevel=4,
         )
 
