@@ -69,6 +69,8 @@ def test_several_callbacks_save_to_folders_of_their_own(tmp_path):
     assert StateStore(tmp_path / "seldom").steps() == [20, 40, 50, 60, 80, 90]
 
 
+# Such a folder needs no lock, of which a warning would tell
+@pytest.mark.filterwarnings("error")
 def test_a_folder_that_cannot_be_written_to_is_noticed_before_the_training(tmp_path):
     (tmp_path / "file").write_text("")
     model = make_model()

@@ -51,8 +51,11 @@ def test_a_second_model_of_the_process_is_refused_until_the_first_ends(folder):
     first.learn(40)
     second = CGP.resume(folder, env())
     assert second.num_timesteps == 40
+    before = {path: path.stat().st_mtime_ns for path in (folder, *folder.iterdir())}
     with pytest.raises(FolderInUseError, match=IN_USE):
         first.learn(10, reset_num_timesteps=False, callback=TrainingCheckpointCallback(10, folder))
+    # Nothing has been written to the folder
+    assert {path: path.stat().st_mtime_ns for path in (folder, *folder.iterdir())} == before
     del second
     gc.collect()
     CGP.resume(folder, env())

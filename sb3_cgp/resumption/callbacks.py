@@ -1,6 +1,7 @@
 """A callback that saves the complete training state, so that an interrupted training can be resumed."""
 
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback
@@ -94,8 +95,12 @@ class TrainingCheckpointCallback(BaseCallback):
         require(self.model.env is not None, "env", None, allowed)
         check_savable(self.model._ensure_replay_buffer())
         self._store = StateStore(self._folder, self.keep)
-        self._store.prepare()
+        # `prepare` names a folder that cannot be made
+        with suppress(OSError):
+            self._folder.mkdir(parents=True, exist_ok=True)
+        # Before anything is written to it
         self.model.hold_folder(self._folder)
+        self._store.prepare()
         known = self.model.saved_to.get(self._folder, frozenset())
         is_another = not self._store.digests() <= known
         allowed = "a folder without the states of another training: continue that one by `resume`, or choose another folder"

@@ -77,7 +77,7 @@ class FolderLock:
         except Timeout:
             raise
         except (OSError, NotImplementedError) as error:
-            if os.access(self.folder, os.W_OK):
+            if self.folder.is_dir() and os.access(self.folder, os.W_OK):
                 warnings.warn(
                     f"The folder {self.folder} cannot be locked ({error}): make sure that no other process uses it.",
                     stacklevel=2,
