@@ -55,9 +55,8 @@ class TrainingCheckpointCallback(BaseCallback):
         self.path = path
         self.keep = keep
         self._saved_at = 0
-        self._rollout_is_over = False
+        self._has_stepped = False
         self._is_in_rollouts = False
-        self._has_trained_without_rollouts = False
         # `learn` may end in the middle of a step, and a training without rollouts may follow
         self._is_within_step = False
         self._has_noted_callbacks = False
@@ -82,7 +81,7 @@ class TrainingCheckpointCallback(BaseCallback):
         return self.path is not None and len(StateStore(self._folder).steps()) > 0
 
     def _on_training_start(self) -> None:
-        self._is_in_rollouts = self._rollout_is_over = self._has_trained_without_rollouts = False
+        self._is_in_rollouts = self._has_stepped = False
         self._has_noted_callbacks = False
         self._saved_at = self.num_timesteps
         if self.path is None:
@@ -127,24 +126,22 @@ class TrainingCheckpointCallback(BaseCallback):
             self._save()
 
     def _on_step(self) -> bool:
-        self._rollout_is_over = False
+        self._has_stepped = True
         self._note_callbacks()
         if self._is_in_rollouts:
             self._is_within_step = True
         else:
-            self._has_trained_without_rollouts = True
             self.stop_if_asked()
         return True
 
     def _on_rollout_end(self) -> None:
-        self._rollout_is_over = True
         self._is_within_step = False
 
     def _on_training_end(self) -> None:
         self._restore_if_resumed()
         # A callback may have ended the training in the middle of a step. rl_zoo3 calls this method twice, and after errors.
-        is_whole = self._rollout_is_over or (self._has_trained_without_rollouts and not self._is_within_step)
-        self._rollout_is_over = self._has_trained_without_rollouts = False
+        is_whole = self._has_stepped and not self._is_within_step
+        self._has_stepped = False
         if self.path is not None and is_whole:
             self._save()
         self.signals.restore()
@@ -218,14 +215,14 @@ class TrainingCheckpointCallback(BaseCallback):
     @property
     def _kept_state(self) -> str:
         """The state that an interrupted training has, or the remedy."""
-        if self._has_trained_without_rollouts and self.model._n_nested_trainings == 1:
+        if self._has_stepped and not self._is_in_rollouts and self.model._n_nested_trainings == 1:
             # Not by `learn`, which saves the state at the start, and repeats this training
             return "`train_policy` saves no state before its end; call it again to go on from the actor as it is"
         return f"its state of step {self._saved_at} is in {self.path}; `resume` continues it" if self.has_state else NO_STATE
 
     def release(self) -> None:
         """Restore the signals' handlers. Save no state until the next training starts, as this one may have failed."""
-        self._rollout_is_over = self._has_trained_without_rollouts = False
+        self._has_stepped = False
         self._saving = []
         self.signals.release()
 

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_cgp.common.rules import require
-from sb3_cgp.resumption.plain_data import NotPlainError, set_plain_attributes, to_plain
+from sb3_cgp.resumption.plain_data import NotPlainError, equal, set_plain_attributes, to_plain
 
 
 class ReplayedEnv(gym.Wrapper):
@@ -110,7 +110,7 @@ class ReplayedEnv(gym.Wrapper):
             self._set_generator(episode["drawn"].get(index))
             self.step(action)
         assert self._episode is not None
-        if not _is_same(self._episode["observation"], episode["observation"]):
+        if not equal(to_plain(self._episode["observation"]), to_plain(episode["observation"])):
             warnings.warn(
                 f"The episode of {self.env} that was repeated led to another observation than the saved one: the environment "
                 "depends on more than its actions and `np_random` since its reset. The training goes on, and is not the same.",
@@ -146,10 +146,3 @@ def _make_new_world(env: gym.Env) -> None:
         # Removes what is in the old world, which the environment's `reset` could not remove from the new one
         walker._destroy()
         walker.world = type(walker.world)()
-
-
-def _is_same(one: Any, other: Any) -> bool:
-    """Compare two observations, arrays or dictionaries of them."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(_is_same(one[key], other[key]) for key in one)
-    return bool(np.array_equal(one, other, equal_nan=True))
