@@ -79,10 +79,10 @@ def test_a_group_goes_on_as_it_is_whatever_the_size_is_now(ledger, tmp_path, siz
     claims, group = begun(ledger, tmp_path)
     for each in claims:
         ledger.release(each)
-    # Seed 3, which has waited for longer, is not of the group
-    assert claim(ledger, tmp_path, 1)[1:] == (None, [3])
     again, same, seeds = claim(ledger, tmp_path, size)
     assert (same, seeds) == (group, [0, 1, 2])
+    # Seed 3, which has waited for longer, is not of the group
+    assert claim(ledger, tmp_path, size)[1:] == (None, [3])
     assert all(ledger.storage.get_trial(each.trial_id).user_attrs[POPULATION] == group.mark for each in again)
 
 
@@ -91,7 +91,6 @@ def test_runs_of_a_group_that_have_ended_are_not_taken_again(ledger, tmp_path):
     ledger.complete(claims[0], 1.0)
     ledger.fail(claims[1], ValueError("NaN"))
     ledger.release(claims[2])
-    claim(ledger, tmp_path, 1)
     assert claim(ledger, tmp_path, 8)[1:] == (group, [2])
 
 
@@ -100,7 +99,8 @@ def test_a_group_without_a_state_here_is_made_anew(ledger, tmp_path):
     for each in claims:
         ledger.release(each)
     _, group, seeds = claim(ledger, tmp_path / "here", 8)
-    assert seeds == [3, 0, 1, 2]
+    # By their place in the sweep, though new trials have been enqueued for the first three
+    assert seeds == [0, 1, 2, 3]
     assert len(group.runs) == 4
 
 
@@ -120,9 +120,9 @@ def test_a_group_is_not_taken_while_a_run_of_it_is_still_trained(ledger, tmp_pat
 
 def test_a_process_that_comes_second_leaves_a_group_to_the_first(ledger, tmp_path):
     claims, group = begun(ledger, tmp_path)
+    claim(ledger, tmp_path, 1)
     for each in claims:
         ledger.release(each)
-    claim(ledger, tmp_path, 1)
     groups = Groups(tmp_path, "study", 8)
     seen = ledger.trials()
     # In the meantime, the first trial is taken, and not marked yet
@@ -142,8 +142,46 @@ def test_a_run_that_began_alone_goes_on_alone(ledger, tmp_path):
     begin(taken.run, folder)
     StateStore(folder / "state").save(1, {})
     ledger.release(taken)
-    assert claim(ledger, tmp_path, 8)[2] == [1, 2, 3]
     assert claim(ledger, tmp_path, 8)[1:] == (None, [0])
+    assert claim(ledger, tmp_path, 8)[2] == [1, 2, 3]
+
+
+def give_back(ledger, claims, logs, with_state=()):
+    """Give runs back as an interrupted process does, some with a state."""
+    for each in claims:
+        if each.run.seed in with_state:
+            folder = run_folder(logs, "study", each.run)
+            begin(each.run, folder)
+            StateStore(folder / "state").save(1, {})
+        ledger.release(each)
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_interrupted_runs_go_on_before_others_begin(ledger, tmp_path, size):
+    claims = [claim(ledger, tmp_path, 1)[0][0] for _ in range(3)]
+    give_back(ledger, [claims[2], claims[0], claims[1]], tmp_path, with_state=(1, 2))
+    assert claim(ledger, tmp_path, size)[1:] == (None, [1])
+    assert claim(ledger, tmp_path, size)[1:] == (None, [2])
+    # Seed 0, whose process was stopped before its first state, keeps its place
+    assert claim(ledger, tmp_path, size)[2] == [0, 3][:size]
+
+
+def test_sessions_shorter_than_a_run_finish_one_run_after_another(ledger, tmp_path):
+    finished = []
+    for session in range(8):
+        (taken,), _, (seed,) = claim(ledger, tmp_path, 1)
+        if session % 2:
+            ledger.complete(taken, 0.0)
+            finished.append(seed)
+        else:
+            give_back(ledger, [taken], tmp_path, with_state=(seed,))
+    assert finished == [0, 1, 2, 3]
+
+
+def test_a_state_on_another_machine_gives_no_preference(ledger, tmp_path):
+    claims = [claim(ledger, tmp_path / "there", 1)[0][0] for _ in range(2)]
+    give_back(ledger, claims, tmp_path / "there", with_state=(1,))
+    assert claim(ledger, tmp_path / "here", 1)[2] == [0]
 
 
 def test_the_size_of_a_population(monkeypatch):

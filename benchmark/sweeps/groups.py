@@ -2,7 +2,8 @@
 Groups of runs that one process trains as a population, and which runs a process takes next.
 
 A process takes the first run that waits and, with it, runs that have the same common settings, up to the size of a
-population. Three kinds of runs are exceptions:
+population. First are the runs with a saved state on this machine, then all others by their place in the sweep, so that
+processes that end before a run does finish one run after another. Three kinds of runs are exceptions:
 
 - A run whose population has a saved state on this machine goes on as an agent of that population, whatever the size is now.
   All of the population's runs that wait are taken together. None of them is taken while another one is still being trained,
@@ -16,6 +17,7 @@ Runs of a population that have ended, or that another process has taken, stay in
 import argparse
 import hashlib
 import json
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -184,22 +186,35 @@ class Groups:
         :return: the plans, in the order in which a process tries them
         """
         owners, names = owned(trials), _names(trials)
+        # By run, all of its trials
+        attempts: dict[str, list[FrozenTrial]] = defaultdict(list)
+        for trial in trials:
+            attempts[trial.user_attrs[KEY]].append(trial)
         waiting = [trial for trial in trials if trial.state is TrialState.WAITING]
         # A trial that is not its run's own is taken alone, and ended
         own = [trial for trial in waiting if owners[trial.user_attrs[KEY]].number == trial.number]
         begun = {trial.number: group for trial in own if (group := self._begun(trial, names)) is not None}
+        alone = {trial.number for trial in own if trial.number not in begun and self._has_state(trial)}
+
+        def place(trial: FrozenTrial) -> tuple[bool, bool, int]:
+            return trial.number not in begun, trial.number not in alone, attempts[trial.user_attrs[KEY]][0].number
+
+        waiting.sort(key=place)
         # By trial, what it has in common with others; only of those that may begin in a population
         common: dict[int, str] = {}
         for trial in own if self._size > 1 else ():
-            if trial.number not in begun and not self._stays_alone(trial, trials):
+            if trial.number not in begun and trial.number not in alone and not _is_dissolved(attempts[trial.user_attrs[KEY]]):
                 settings = common_settings(_run(trial))
                 common |= {} if settings is None else {trial.number: settings}
         seen = set()
-        for trial in waiting:
+        for index, trial in enumerate(waiting):
             group = begun.get(trial.number)
             if group is None:
-                like = [each for each in waiting if trial.number in common and common.get(each.number) == common[trial.number]]
-                others = [each for each in like if each.number > trial.number]
+                others = [
+                    each
+                    for each in waiting[index + 1 :]
+                    if trial.number in common and common.get(each.number) == common[trial.number]
+                ]
                 yield Plan([trial, *others[: self._size - 1]])
             elif group.folder not in seen:
                 seen.add(group.folder)
@@ -216,13 +231,14 @@ class Groups:
         group = Group.read(self._folder / FOLDER / name)
         return group if _run(trial) in group.runs and StateStore(group.states).steps() else None
 
-    def _stays_alone(self, trial: FrozenTrial, trials: Sequence[FrozenTrial]) -> bool:
-        """Return whether a run has a state of its own, or was in a population that was dissolved."""
-        outcomes = (each.user_attrs.get(OUTCOME, "") for each in trials if each.user_attrs[KEY] == trial.user_attrs[KEY])
+    def _has_state(self, trial: FrozenTrial) -> bool:
         run = _run(trial)
-        return any(outcome.startswith(DISSOLVED) for outcome in outcomes) or has_state(
-            run, run_folder(self._logs, self._study, run)
-        )
+        return has_state(run, run_folder(self._logs, self._study, run))
+
+
+def _is_dissolved(attempts: Sequence[FrozenTrial]) -> bool:
+    """Return whether one of a run's trials was in a population that was dissolved."""
+    return any(trial.user_attrs.get(OUTCOME, "").startswith(DISSOLVED) for trial in attempts)
 
 
 def _as_json(runs: Sequence[Run]) -> bytes:
