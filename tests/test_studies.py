@@ -1,5 +1,6 @@
 """A sweep's ledger: no run is skipped and none counts twice, whatever dies between which two steps."""
 
+import errno
 import os
 import random
 import signal
@@ -88,6 +89,75 @@ def test_what_the_machine_lacks_is_no_fault_of_the_run(ledger, monkeypatch, tmp_
         execute_runs(ledger, tmp_path, "a process")
     assert ledger.records() == []
     assert len(ledger.left()) == 3
+
+
+def attempt(ledger, logs, error, steps):
+    """Let a process train as a run's training does that raises an error after some steps."""
+
+    def train(run, folder, report, watch, device):
+        watch(steps)
+        raise error
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(worker, "train", train)
+        with pytest.raises(type(error)):
+            execute_runs(ledger, logs, "a process")
+
+
+@pytest.mark.usefixtures("clock")
+@pytest.mark.parametrize("error", [OSError("no such asset"), MemoryError("buffer"), th.OutOfMemoryError("GPU")])
+@pytest.mark.parametrize(("steps", "attempts"), [(0, 3), (50, 4)])
+def test_a_run_that_ends_its_processes_every_time_at_the_same_step_fails(tmp_path, error, steps, attempts):
+    ledger = Ledger(InMemoryStorage(), "study", GRACE)
+    ledger.open(make_sweep(["Good"], seeds=1), {"experiment": "tiny"})
+    for _ in range(attempts):
+        assert ledger.records() == []
+        attempt(ledger, tmp_path, error, steps)
+    (record,) = ledger.records()
+    assert (record.final, record.error) == (None, f"{type(error).__name__}: {error}")
+    assert ledger.left() == []
+
+
+@pytest.mark.usefixtures("clock")
+def test_a_run_that_gets_further_each_time_is_no_failure(tmp_path):
+    ledger = Ledger(InMemoryStorage(), "study", GRACE)
+    ledger.open(make_sweep(["Good"], seeds=1), {"experiment": "tiny"})
+    for steps in (10, 10, 10, 20, 20, 20, 30):
+        attempt(ledger, tmp_path, OSError("disk"), steps)
+    assert len(ledger.left()) == 1
+
+
+@pytest.mark.usefixtures("clock")
+@pytest.mark.parametrize(
+    "error",
+    [OSError(errno.ENOSPC, "No space left"), PermissionError("logs"), ImportError("no Box2D"), ConnectionError("database")],
+)
+def test_an_error_of_every_run_is_never_a_failure(tmp_path, error):
+    ledger = Ledger(InMemoryStorage(), "study", GRACE)
+    ledger.open(make_sweep(["Good"], seeds=1), {"experiment": "tiny"})
+    for _ in range(5):
+        attempt(ledger, tmp_path, error, 0)
+    assert len(ledger.left()) == 1
+
+
+@pytest.mark.usefixtures("clock")
+def test_runs_that_end_their_processes_wait_for_all_others(ledger, tmp_path):
+    ends = {0}
+
+    def train(run, *args):
+        if run.seed in ends:
+            raise MemoryError
+        return pretend_to_train(run, *args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(worker, "train", train)
+        for left in (3, 1):
+            with pytest.raises(MemoryError):
+                execute_runs(ledger, tmp_path, "a process")
+            assert len(ledger.left()) == left
+        ends.clear()
+        execute_runs(ledger, tmp_path, "a process")
+    assert_each_run_once(ledger.trials(), make_sweep(["Good"], seeds=3))
 
 
 @pytest.mark.usefixtures("heeds_interruptions")

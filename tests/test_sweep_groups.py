@@ -184,6 +184,23 @@ def test_a_state_on_another_machine_gives_no_preference(ledger, tmp_path):
     assert claim(ledger, tmp_path / "here", 1)[2] == [0]
 
 
+def test_a_population_that_ends_its_processes_every_time_is_dissolved(ledger, tmp_path, monkeypatch):
+    def train_group(group, folders, claimed, watch, device):
+        group.write()
+        StateStore(group.states).save(1, {})
+        raise MemoryError
+
+    monkeypatch.setattr(worker, "train_group", train_group)
+    monkeypatch.setattr(worker, "HeartbeatThread", Heart)
+    for _ in range(3):
+        claims, group, seeds = claim(ledger, tmp_path, 8)
+        assert seeds == [0, 1, 2, 3]
+        with pytest.raises(MemoryError):
+            worker._train_claimed(ledger, claims, group, tmp_path, 1.0, None, "cpu")
+    assert claim(ledger, tmp_path, 8)[1:] == (None, [0])
+    assert ledger.records() == []
+
+
 def test_the_size_of_a_population(monkeypatch):
     assert (parse(["e6"]).population, parse(["e6", "--population"]).population) == ("auto", "auto")
     assert (population_size("auto", "cpu"), population_size(5, "cpu")) == (1, 5)

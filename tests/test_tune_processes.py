@@ -9,7 +9,7 @@ from tunings import arguments, samples, tuner_of
 
 from benchmark import tune
 from benchmark.sweeps import tuner
-from benchmark.sweeps.study_trials import ERROR
+from benchmark.sweeps.study_trials import ERROR, LOST
 from benchmark.sweeps.tuning import ORIGIN, SCORES
 from benchmark.sweeps.validation import SweepError
 
@@ -79,6 +79,37 @@ def test_a_lost_configuration_is_taken_up_by_another_process(work, pretend, tmp_
     lost, again = work(storage=storage, trials=1)
     assert (again.value, again.params) == (0.5, lost.params)
     assert runs == [("trial-0", 0), ("trial-0", 1)]
+
+
+@pytest.mark.parametrize("error", [OSError("no such asset"), MemoryError("buffer")])
+def test_a_configuration_that_ends_its_processes_every_time_fails_and_the_next_is_trained(work, pretend, error):
+    storage = InMemoryStorage()
+
+    def score(run):
+        if run.method == "trial-0" and run.seed == 1:
+            raise error
+        return 1.0
+
+    runs = pretend(score)
+    for _ in range(4):
+        with pytest.raises(type(error)):
+            work(storage=storage, trials=2)
+    trials = work(storage=storage, trials=2)
+    assert [trial.state for trial in trials] == [TrialState.FAIL] * 4 + [TrialState.COMPLETE]
+    assert [ERROR in trial.user_attrs for trial in trials] == [False] * 3 + [True, False]
+    assert trials[3].user_attrs[ERROR] == f"{type(error).__name__}: {error}"
+    assert runs[-2:] == [("trial-4", 0), ("trial-4", 1)]
+
+
+def test_a_configuration_whose_processes_are_lost_every_time_fails(tmp_path):
+    storage = InMemoryStorage()
+    tuner = tuner_of(tune.parse(arguments("--logs", str(tmp_path))), storage)
+    for _ in range(3):
+        trial = tuner._study.ask()
+        tuner._tuning.sample(trial)
+        tuner._give_back(trial.number, LOST)
+    assert [trial.state for trial in tuner.trials()] == [TrialState.FAIL] * 3
+    assert [trial.user_attrs.get(ERROR) for trial in tuner.trials()] == [None, None, LOST]
 
 
 def test_a_process_that_was_given_up_leaves_the_trial_alone(work, pretend, tmp_path):

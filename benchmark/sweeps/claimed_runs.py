@@ -4,11 +4,11 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
-from benchmark.sweeps.groups import DISSOLVED
+from benchmark.sweeps.attempts import DISSOLVED, MOST, in_words, outcome_of
 from benchmark.sweeps.heartbeats import TrialLostError
 from benchmark.sweeps.runs import Run
 from benchmark.sweeps.studies import Ledger
-from benchmark.sweeps.study_trials import Claim
+from benchmark.sweeps.study_trials import STOPPED, Claim
 
 
 class ClaimedRuns:
@@ -117,11 +117,24 @@ class ClaimedRuns:
         """
         return all(self._ledger.holds(claim) for claim in self._open.values())
 
-    def release(self) -> None:
-        """Give back all open runs, to be continued by any process."""
+    def release(self, outcome: str = STOPPED) -> None:
+        """
+        Give back all open runs, to be continued by any process.
+
+        :param outcome: the reason, for people
+        """
         with self._lock:
             while self._open:
-                self._ledger.release(self._open.popitem()[1])
+                self._ledger.release(self._open.popitem()[1], outcome)
+
+    def is_stuck(self, error: Exception) -> bool:
+        """
+        Return whether an error of the machine has ended an open run again and again, at no later step.
+
+        :param error: the error
+        :return: whether it is to be taken for an error of the run's own; never for one that every run would have
+        """
+        return outcome_of(error) != STOPPED and any(self._ledger.fruitless(claim) >= MOST for claim in self._open.values())
 
     def dissolve(self, error: BaseException) -> None:
         """
@@ -129,6 +142,4 @@ class ClaimedRuns:
 
         :param error: the error of the population
         """
-        with self._lock:
-            while self._open:
-                self._ledger.release(self._open.popitem()[1], f"{DISSOLVED}{type(error).__name__}: {error}")
+        self.release(DISSOLVED + in_words(error))

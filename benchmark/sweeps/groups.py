@@ -3,7 +3,8 @@ Groups of runs that one process trains as a population, and which runs a process
 
 A process takes the first run that waits and, with it, runs that have the same common settings, up to the size of a
 population. First are the runs with a saved state on this machine, then all others by their place in the sweep, so that
-processes that end before a run does finish one run after another. Three kinds of runs are exceptions:
+processes that end before a run does finish one run after another. Last are those whose last attempts came to nothing, as they
+may end this process, too. Three kinds of runs are exceptions:
 
 - A run whose population has a saved state on this machine goes on as an agent of that population, whatever the size is now.
   All of the population's runs that wait are taken together. None of them is taken while another one is still being trained,
@@ -27,6 +28,7 @@ from optuna.trial import FrozenTrial, TrialState
 from stable_baselines3.common.utils import get_device
 
 from benchmark.common.arguments import count
+from benchmark.sweeps.attempts import DISSOLVED, fruitless
 from benchmark.sweeps.heartbeats import TrialLostError
 from benchmark.sweeps.run import has_state, run_folder
 from benchmark.sweeps.runs import Run
@@ -43,8 +45,6 @@ FOLDER = "populations"
 GROUP_RUNS = "runs.json"
 # Agents of a population on a GPU by default
 ON_GPU = 32
-# The beginning of the outcome of a run's trial
-DISSOLVED = "dissolved: "
 
 
 def add_population(parser: argparse.ArgumentParser) -> None:
@@ -196,8 +196,9 @@ class Groups:
         begun = {trial.number: group for trial in own if (group := self._begun(trial, names)) is not None}
         alone = {trial.number for trial in own if trial.number not in begun and self._has_state(trial)}
 
-        def place(trial: FrozenTrial) -> tuple[bool, bool, int]:
-            return trial.number not in begun, trial.number not in alone, attempts[trial.user_attrs[KEY]][0].number
+        def place(trial: FrozenTrial) -> tuple[int, bool, bool, int]:
+            of_run = attempts[trial.user_attrs[KEY]]
+            return fruitless(of_run), trial.number not in begun, trial.number not in alone, of_run[0].number
 
         waiting.sort(key=place)
         # By trial, what it has in common with others; only of those that may begin in a population

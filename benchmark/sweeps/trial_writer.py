@@ -5,9 +5,10 @@ from typing import Any
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
 
+from benchmark.sweeps.attempts import fruitless, in_words
 from benchmark.sweeps.heartbeats import TrialLostError, noticing_loss, send_beat
 from benchmark.sweeps.storages import patiently
-from benchmark.sweeps.study_trials import ERROR, OUTCOME, Claim
+from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME, Claim
 from benchmark.sweeps.study_view import StudyView
 
 
@@ -84,6 +85,15 @@ class TrialWriter(StudyView):
         """
         return not patiently(self.storage.get_trial, claim.trial_id).state.is_finished()
 
+    def fruitless(self, claim: Claim) -> int:
+        """
+        Count the last attempts at a run that got no further than those before, this one included.
+
+        :param claim: the run
+        :return: the number
+        """
+        return fruitless(trial for trial in self.trials() if trial.user_attrs[KEY] == claim.run.key)
+
     def fail(self, claim: Claim, error: BaseException) -> None:
         """
         End a run that failed for its own reasons.
@@ -92,7 +102,7 @@ class TrialWriter(StudyView):
         :param error: the error
         """
         try:
-            self.annotate(claim, ERROR, f"{type(error).__name__}: {error}")
+            self.annotate(claim, ERROR, in_words(error))
         except TrialLostError:
             return
         self._end(claim.trial_id, TrialState.FAIL)

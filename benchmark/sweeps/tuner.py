@@ -18,6 +18,7 @@ from optuna.samplers import TPESampler
 from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState
 
+from benchmark.sweeps.attempts import MOST, SUSPECT, fruitless, in_words, outcome_of
 from benchmark.sweeps.heartbeats import HeartbeatThread, SilenceDetector, TrialLostError, send_beat
 from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, run_folder, train
 from benchmark.sweeps.scoring import PRUNERS, SCORING
@@ -78,7 +79,7 @@ class Tuner:
 
     def recover(self) -> None:
         """
-        Enqueue the configurations of lost processes again.
+        Enqueue the configurations of lost processes again, but for one whose processes are lost every time at the same step.
 
         If this process dies between the two steps of that, a configuration is lost, and another is sampled in its place.
         """
@@ -88,6 +89,8 @@ class Tuner:
     def _give_back(self, number: int, outcome: str) -> None:
         trial_id = self._id(number)
         try:
+            if outcome != STOPPED and fruitless(self._attempts(number)) >= MOST:
+                patiently(self._storage.set_trial_user_attr, trial_id, ERROR, outcome.removeprefix(SUSPECT))
             patiently(self._storage.set_trial_user_attr, trial_id, OUTCOME, outcome)
             patiently(self._storage.set_trial_state_values, trial_id, TrialState.FAIL)
         except UpdateFinishedTrialError:
@@ -98,6 +101,12 @@ class Tuner:
         if params and ERROR not in trial.user_attrs:
             attributes = {ORIGIN: trial.user_attrs.get(ORIGIN, trial.number), SCORES: trial.user_attrs.get(SCORES, [])}
             patiently(self._study.enqueue_trial, params, attributes)
+
+    def _attempts(self, number: int) -> list[FrozenTrial]:
+        """List the trials of a trial's configuration."""
+        trials = self.trials()
+        origin = trials[number].user_attrs.get(ORIGIN, number)
+        return [trial for trial in trials if trial.user_attrs.get(ORIGIN, trial.number) == origin]
 
     def _id(self, number: int) -> int:
         return patiently(self._storage.get_trial_id_from_study_id_trial_number, self._study_id, number)
@@ -126,9 +135,9 @@ class Tuner:
             patiently(self._study.tell, trial, value, state, skip_if_finished=True)
         except (TrialLostError, UpdateFinishedTrialError):
             print(f"Trial {trial.number} was given to another process", flush=True)
-        except MACHINE_ERRORS:
+        except MACHINE_ERRORS as error:
             with undisturbed():
-                self._give_back(trial.number, STOPPED)
+                self._give_back(trial.number, outcome_of(error))
             raise
         except Exception as error:
             traceback.print_exc()
@@ -165,7 +174,7 @@ class Tuner:
 
     def _fail(self, trial_id: int, error: Exception) -> None:
         try:
-            patiently(self._storage.set_trial_user_attr, trial_id, ERROR, f"{type(error).__name__}: {error}")
+            patiently(self._storage.set_trial_user_attr, trial_id, ERROR, in_words(error))
             patiently(self._storage.set_trial_state_values, trial_id, TrialState.FAIL)
         except UpdateFinishedTrialError:
             pass

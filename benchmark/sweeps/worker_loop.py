@@ -12,6 +12,7 @@ from filelock import FileLock
 from stable_baselines3.common.utils import get_device
 
 from benchmark.common.provenance import machine, processor
+from benchmark.sweeps.attempts import outcome_of
 from benchmark.sweeps.claimed_runs import ClaimedRuns
 from benchmark.sweeps.groups import FOLDER, GROUP_RUNS, Group, Groups
 from benchmark.sweeps.heartbeats import BEAT, HeartbeatThread, TrialLostError
@@ -92,22 +93,32 @@ def _train_claimed(
         except TrialLostError:
             print(f"{_in_words(claims, group)} was given to another process", flush=True)
             claimed.release()
-        except MACHINE_ERRORS:
+        except MACHINE_ERRORS as error:
             with undisturbed():
-                claimed.release()
+                if claimed.is_stuck(error):
+                    _give_up(claimed, runs, group, folders, error)
+                else:
+                    claimed.release(outcome_of(error))
             raise
         except Exception as error:
             traceback.print_exc()
-            if group is None:
-                claimed.fail(runs[0], error)
-            else:
-                if claimed.is_held():
-                    _forget(group, folders)
-                claimed.dissolve(error)
+            _give_up(claimed, runs, group, folders, error)
         except BaseException:
             with undisturbed():
                 claimed.release()
             raise
+
+
+def _give_up(
+    claimed: ClaimedRuns, runs: Sequence[Run], group: Group | None, folders: Sequence[Path], error: Exception
+) -> None:
+    """End a run by an error, or dissolve a population, of which some run is to blame."""
+    if group is None:
+        claimed.fail(runs[0], error)
+    else:
+        if claimed.is_held():
+            _forget(group, folders)
+        claimed.dissolve(error)
 
 
 def _in_words(claims: Sequence[Claim], group: Group | None) -> str:
