@@ -14,6 +14,7 @@ import yaml
 from benchmark.common.zoo import read_entry
 from benchmark.sweeps.experiments import included_sweeps, load_sweep, sweeps_folder
 from benchmark.sweeps.processes import share_of_cores, start_workers
+from benchmark.sweeps.runs import overview
 from benchmark.sweeps.validation import SweepError
 
 ROOT = Path(__file__).parent.parent
@@ -190,7 +191,7 @@ def test_short_runs_learn_with_the_numbers_of_random_steps_that_a_file_does_not_
     assert starts() == {"CGP": 200, "TD3": 200, "PPO": None}
     assert starts(hyperparams={"learning_starts": 1_500}, methods={"CGP": methods["CGP"]}) == {"CGP": 1_500}
     # Long runs have what their algorithm or their entry says
-    assert starts(steps=200_000) == {"CGP": None, "TD3": None, "PPO": None}
+    assert starts(steps=200_000) == {"CGP": None, "TD3": 10_000, "PPO": None}
 
 
 def test_a_number_of_random_steps_that_is_meant_for_the_length_of_the_runs_is_kept(tmp_path, sweep_of):
@@ -206,7 +207,7 @@ def test_a_number_of_random_steps_that_is_meant_for_the_length_of_the_runs_is_ke
     entry = read_entry("cgp", "Pendulum-v1")
     assert entry["learning_starts"] > entry["n_timesteps"] // 10
     for steps, expected in (
-        (int(entry["n_timesteps"]), None),
+        (int(entry["n_timesteps"]), entry["learning_starts"]),
         (int(entry["n_timesteps"]) - 10, entry["n_timesteps"] // 10 - 1),
     ):
         sweep = sweep_of(methods={"CGP": {"algo": "cgp", "tuned": True}}, steps=steps)
@@ -215,7 +216,28 @@ def test_a_number_of_random_steps_that_is_meant_for_the_length_of_the_runs_is_ke
 
 def test_methods_of_ones_own(sweep_of):
     sweep = sweep_of(methods={"mine": {"algo": "ppo", "hyperparams": {"n_steps": 64}, "tuned": True}})
-    assert {(run.method, run.algo, run.tuned) for run in sweep.runs()} == {("mine", "ppo", True)}
+    assert {(run.method, run.algo) for run in sweep.runs()} == {("mine", "ppo")}
+
+
+def test_runs_of_tuned_methods_have_the_tasks_entries_once_and_for_all(sweep_of, tmp_path, monkeypatch):
+    """All but the steps, which are the sweep's, and the callback that saves states, in whose place the sweep has its own."""
+    monkeypatch.setattr("sb3_cgp.zoo.registration.hyperparams_folder", lambda: tmp_path)
+    entries = {task: {"n_timesteps": 9.0, "policy": "MlpPolicy", "gamma": gamma, "tau": 0.1, "callback": "module.Callback"}
+               for task, gamma in (("Pendulum-v1", 0.5), ("Reacher-v5", 0.6))}  # fmt: skip
+    (tmp_path / "cgp.yml").write_text(yaml.safe_dump(entries))
+    methods = {"CGP": {"algo": "cgp", "tuned": True, "hyperparams": {"tau": 0.2}}, "Own": {"algo": "cgp"}}
+    sweep = sweep_of(methods=methods, tasks=list(entries), seeds=1, hyperparams={"learning_starts": 1})
+    before = sweep.runs()
+    expected = {"policy": "MlpPolicy", "tau": 0.2, "learning_starts": 1}
+    assert [run.hyperparams for run in before if run.method == "CGP"] == [expected | {"gamma": gamma} for gamma in (0.5, 0.6)]
+    assert [run.hyperparams for run in before if run.method == "Own"] == [{"learning_starts": 1}] * 2
+    names = {"CGP,Pendulum-v1": 0.5, "CGP,Reacher-v5": 0.6, "Own": None}
+    described = overview(before, methods, entries)["configurations"]
+    assert {name: entry.get("gamma") for name, entry in described.items()} == names
+    (tmp_path / "cgp.yml").write_text("{}")
+    assert sweep.runs() == before
+    with pytest.raises(SweepError, match=r"mine\.yml: methods: `tuned: true` needs an entry: .*Pendulum-v1"):
+        sweep_of(methods=methods)
 
 
 def test_a_subset_of_seeds_and_a_checkpoint_interval(sweep_of):

@@ -8,8 +8,14 @@ from studies import GRACE, Clock
 from tunings import arguments, tuner_of
 
 from benchmark import tune
+from benchmark.sweeps.experiments import Sweep
+from benchmark.sweeps.storages import open_storage
+from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import KEY, distributions_of, with_seed
+from benchmark.sweeps.sweep_files import SweepFile
 from benchmark.sweeps.validation import SweepError
+from benchmark.worker import open_ledger as open_ledger_of_worker
+from benchmark.worker import parse as parse_worker
 
 
 def test_a_study_is_not_opened_with_other_settings(ledger):
@@ -31,6 +37,39 @@ def test_further_seeds_and_methods_have_the_hyperparameters_of_the_first(ledger)
     # Other changes do not name hyperparameters
     open_ledger(ledger.storage, Clock(), seeds=4, changes=["evaluation_episodes 1"])
     assert len(ledger.trials()) == 4
+
+
+def test_an_entry_that_is_edited_in_between_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_cgp.zoo.registration.hyperparams_folder", lambda: tmp_path)
+    methods = {"Good": {"algo": "cgp", "tuned": True}}
+
+    def sweep(gamma, seeds):
+        (tmp_path / "cgp.yml").write_text(f"Pendulum-v1: {{n_timesteps: 100, policy: MlpPolicy, gamma: {gamma}}}")
+        content = dict(title="A test", methods=methods, tasks=["Pendulum-v1"], steps=100, seeds=seeds, evaluation_interval=50)
+        file = SweepFile.model_validate(content)
+        return Sweep("tiny", file, file.methods)
+
+    ledger = Ledger(InMemoryStorage(), "study")
+    ledger.open(sweep(0.5, 1), {"experiment": "tiny"})
+    with pytest.raises(SweepError, match=r"'study': hyperparams: was .*'gamma': 0\.5.* and is now .*'gamma': 0\.6"):
+        ledger.open(sweep(0.6, 2), {"experiment": "tiny"})
+    ledger.open(sweep(0.5, 2), {"experiment": "tiny"})
+    assert {trial.user_attrs["run"]["hyperparams"]["gamma"] for trial in ledger.trials()} == {0.5}
+
+
+def test_runs_of_an_earlier_version_that_lack_their_entry_are_refused(tmp_path):
+    """They would take the entry that the YAML file has when they begin."""
+    url = f"sqlite:///{tmp_path}/studies.db"
+    ledger = open_ledger(open_storage(url), Clock())
+    trial = ledger.trials()[1]
+    ledger.storage.set_trial_user_attr(ledger._id(trial), "run", trial.user_attrs["run"] | {"tuned": True})
+    message = "'study': was begun by an earlier version, which did not record the entries of `tuned: true`.*--study"
+    with pytest.raises(SweepError, match=message):
+        open_ledger(ledger.storage, Clock())
+    with pytest.raises(SweepError, match=message):
+        open_ledger_of_worker(parse_worker(["--study", "study", "--storage", url, "--logs", str(tmp_path)]))
+    # Their records can be exported
+    assert len(ledger.description()["configurations"]) == 1
 
 
 def test_a_sweep_and_a_tuning_do_not_share_a_study(ledger):

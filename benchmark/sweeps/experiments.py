@@ -4,20 +4,21 @@ Sweeps as data: the files of ``hyperparams/sweeps`` with the changes of a comman
 A file's keys are the fields of :class:`~benchmark.sweeps.sweep_files.SweepFile`.
 """
 
-import functools
 import itertools
 import math
 import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from huggingface_sb3 import EnvironmentName
 
 from benchmark.common.sweep_names import METHODS_FILE, problem_of, sweep_names, sweep_path, sweeps_folder
-from benchmark.common.zoo import EVALUATIONS_PER_RUN, read_entry, shortened_warm_up
+from benchmark.common.zoo import EVALUATIONS_PER_RUN, shortened_warm_up
+from benchmark.sweeps.entries import base_entry
 from benchmark.sweeps.hyperparameters import problems
 from benchmark.sweeps.runs import Run, checkpoint_interval
 from benchmark.sweeps.sweep_files import Hyperparams, Inclusion, Method, Packages, SweepFile
@@ -77,9 +78,9 @@ class Sweep:
 
     def _run(self, method: str, task: str, settings: dict[str, Any], seed: int) -> Run:
         file = self.file
-        hyperparams = self.methods[method].hyperparams
-        algo, is_tuned = self.methods[method].algo, self.methods[method].tuned
-        hyperparams = hyperparams | self._warm_up(method, task) | file.hyperparams
+        # The steps are the sweep's, and its own callback saves states
+        entry = {name: value for name, value in self._entries[method, task].items() if name not in ("n_timesteps", "callback")}
+        hyperparams = entry | self.methods[method].hyperparams | self._warm_up(method, task) | file.hyperparams
         for axis, value in settings.items():
             hyperparams = hyperparams | file.axes[axis].hyperparams(axis, value, method)
         return Run(
@@ -87,9 +88,9 @@ class Sweep:
             task,
             settings,
             seed,
-            algo,
+            self.methods[method].algo,
             hyperparams,
-            is_tuned,
+            False,
             file.steps,
             file.evaluation_interval,
             file.evaluation_episodes,
@@ -97,10 +98,22 @@ class Sweep:
             file.gym_packages,
         )
 
+    @cached_property
+    def _entries(self) -> dict[tuple[str, str], Hyperparams]:
+        """The entry that each tuned method starts from on each task, read once; empty for the other methods."""
+        try:
+            return {
+                (name, task): base_entry(method.algo, task) if method.tuned else {}
+                for name, method in self.methods.items()
+                for task in self.file.tasks
+            }
+        except ValueError as error:
+            raise SweepError(self.path or self.name, "methods", f"`tuned: true` needs an entry: {error}") from error
+
     def _warm_up(self, method: str, task: str) -> dict[str, int]:
         """Return the number of random steps at the start, where it replaces one that is meant for longer runs."""
         algo, own = self.methods[method].algo, self.methods[method].hyperparams
-        entry = tuned_entry(algo, task) if self.methods[method].tuned else {}
+        entry = self._entries[method, task]
         if "learning_starts" in own:
             # The file of named methods serves runs of all lengths
             is_meant = isinstance(self.file.methods, dict) and not self.is_shortened
@@ -118,21 +131,6 @@ class Sweep:
             warm_up = self._warm_up(run.method, run.task)
             if warm_up and warm_up.items() <= run.hyperparams.items():
                 return warm_up
-        return {}
-
-
-@functools.cache
-def tuned_entry(algo: str, task: str) -> Hyperparams:
-    """
-    Return the hyperparameters that a tuned method starts from.
-
-    :param algo: the algorithm's name in rl_zoo3
-    :param task: the environment, as it is registered
-    :return: the entry of the algorithm's YAML file; empty if it has none, which the construction of a model refuses
-    """
-    try:
-        return read_entry(algo, task)
-    except ValueError:
         return {}
 
 

@@ -18,8 +18,8 @@ class Run:
     :param settings: the values of the axes
     :param seed: the seed
     :param algo: the algorithm's name in rl_zoo3
-    :param hyperparams: hyperparameters, as in rl_zoo3's YAML files
-    :param tuned: whether they come on top of those of the algorithm's YAML file
+    :param hyperparams: all hyperparameters that are not the algorithm's defaults, as in rl_zoo3's YAML files
+    :param tuned: False; True for a run of an earlier version whose hyperparameters lack those of the algorithm's YAML file
     :param steps: environment steps
     :param evaluation_interval: environment steps between two evaluations
     :param evaluation_episodes: episodes of each evaluation
@@ -59,10 +59,18 @@ def overview(runs: Iterable[Run], methods: Iterable[str], tasks: Iterable[str]) 
     :param methods: all methods of the sweep, in order
     :param tasks: all environments of the sweep, in order
     :return: the methods, tasks and seeds of the runs, the number of seeds of each method, that of all runs, and the
-        hyperparameters of each configuration
+        hyperparameters of each configuration, on each task if they differ
     """
     by_key = {run.key: run for run in runs}
     ordered = sorted(by_key.values(), key=lambda run: run.configuration)
+    of_configurations: dict[str, dict[str, dict[str, Any]]] = {}
+    for run in ordered:
+        of_configurations.setdefault(run.configuration, {})[run.task] = {"algo": run.algo, **run.hyperparams}
+    configurations: dict[str, dict[str, Any]] = {}
+    for name, by_task in of_configurations.items():
+        entries = list(by_task.values())
+        is_one = all(entry == entries[0] for entry in entries)
+        configurations |= {name: entries[0]} if is_one else {f"{name},{task}": entry for task, entry in by_task.items()}
     present = [method for method in methods if any(run.method == method for run in ordered)]
     return {
         "methods": present,
@@ -70,7 +78,7 @@ def overview(runs: Iterable[Run], methods: Iterable[str], tasks: Iterable[str]) 
         "seeds": sorted({run.seed for run in ordered}),
         "seeds_of_methods": {method: len({run.seed for run in ordered if run.method == method}) for method in present},
         "runs_planned": len(ordered),
-        "configurations": {run.configuration: {"algo": run.algo, **run.hyperparams} for run in ordered},
+        "configurations": configurations,
     }
 
 

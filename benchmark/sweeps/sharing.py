@@ -15,7 +15,6 @@ from rl_zoo3 import ALGOS
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from benchmark.sweeps.experiments import tuned_entry
 from benchmark.sweeps.runs import Run
 from sb3_cgp import CGP
 from sb3_cgp.population.agents import COMMON, OWN, Arguments, check_supported, merge_arguments
@@ -41,7 +40,7 @@ ZOO = ("policy", "n_timesteps", "noise_type", "noise_std", "env_kwargs", "env_wr
 # The hyperparameters in which the runs of one population may differ
 DIFFERENT = (*OWN, "noise_std")
 # The fields of a run in which the runs of one population may differ
-DIFFERENT_FIELDS = ("method", "settings", "seed", "hyperparams", "tuned")
+DIFFERENT_FIELDS = ("method", "settings", "seed", "hyperparams")
 
 
 def common_settings(run: Run) -> str | None:
@@ -51,9 +50,7 @@ def common_settings(run: Run) -> str | None:
     :param run: the run
     :return: a text that is the same for all of these runs, and for no others; None for a run that is trained alone
     """
-    # The callback of an entry, which saves states, is replaced
-    entry = tuned_entry(run.algo, run.task) if run.tuned else {}
-    hyperparams = {name: value for name, value in entry.items() if name != "callback"} | run.hyperparams
+    hyperparams = run.hyperparams
     if run.algo not in AS_CGP or not hyperparams.keys() <= {*OWN, *COMMON, *ZOO}:
         return None
     frequency = hyperparams.get("train_freq", 1)

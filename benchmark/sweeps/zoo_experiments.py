@@ -43,7 +43,6 @@ def resumed_experiment(kind: Callable[..., Experiment], run: Run, folder: Path, 
     """
     if not has_settings(folder):
         raise NoStateLeftError(f"{folder} has no {ZOO_CONFIG}, which rl_zoo3 saves when a run begins")
-    # With the hyperparameters of the algorithm's YAML file
     (saved,) = folder.glob(ZOO_CONFIG)
     return kind(folder, _arguments(run, folder, device), dict(yaml.load(saved.read_text(), Loader=yaml.UnsafeLoader)))
 
@@ -72,7 +71,6 @@ def new_experiment(kind: Callable[..., Experiment], run: Run, folder: Path, devi
         seed=run.seed,
         verbose=0,
         device=device,
-        hyperparams=_hyperparams(run) if run.tuned else None,
     )
     manager.save_path = str(folder)
     manager.params_path = f"{folder}/{manager.env_name}"
@@ -92,15 +90,13 @@ def _hyperparams(run: Run) -> dict[str, Any]:
 
 def _arguments(run: Run, folder: Path, device: str) -> argparse.Namespace:
     """Return the arguments of rl_zoo3.train for the run: rl_zoo3's other scripts and a resumption read them."""
-    conf_file = None
-    if not run.tuned:
-        conf_file = folder / "hyperparams.yml"
-        write_atomically(conf_file, yaml.safe_dump({run.task: _hyperparams(run)}).encode())
+    conf_file = folder / "hyperparams.yml"
+    write_atomically(conf_file, yaml.safe_dump({run.task: _hyperparams(run)}).encode())
     return argparse.Namespace(
         algo=run.algo,
         env=run.task,
         seed=run.seed,
-        conf_file=None if conf_file is None else str(conf_file),
+        conf_file=str(conf_file),
         device=device,
         env_kwargs={},
         eval_env_kwargs=None,
