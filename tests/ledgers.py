@@ -5,11 +5,12 @@ import os
 from studies import GRACE, make_sweep
 
 from benchmark.sweeps.studies import Ledger
+from benchmark.sweeps.study_trials import SHARED
 
 
 def open_ledger(storage, clock, **sweep):
     ledger, made = Ledger(storage, "study", GRACE, clock), make_sweep(**({"methods": ["Good"], "seeds": 3} | sweep))
-    ledger.open(made, {"experiment": "tiny", "settings_in_words": "; ".join(made.changes)})
+    ledger.open(made, {"experiment": "tiny", SHARED: made.shared})
     return ledger
 
 

@@ -21,11 +21,11 @@ from sb3_cgp.resumption.store import StateStore
 GRACE = 60.0
 
 
-def make_sweep(methods=("Good", "Bad"), seeds=2, changes=(), **fields):
+def make_sweep(methods=("Good", "Bad"), seeds=2, **fields):
     """Of methods that need no training: "Bad" fails for its own reasons."""
     known = {name: Method(algo="td3", hyperparams={"policy": "MlpPolicy"}) for name in ("Good", "Bad", "Other")}
     content = dict(title="A test", methods=list(known), tasks=["Pendulum-v1"], steps=100, seeds=seeds, evaluation_interval=50)
-    return Sweep("tiny", SweepFile.model_validate(content | fields), {name: known[name] for name in methods}, list(changes))
+    return Sweep("tiny", SweepFile.model_validate(content | fields), {name: known[name] for name in methods})
 
 
 def pretend_to_train(run, folder, report, watch, device):

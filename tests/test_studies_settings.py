@@ -4,7 +4,7 @@ import pytest
 from ledgers import look_for, open_ledger, trials_of
 from optuna.storages import InMemoryStorage, RDBStorage
 from optuna.trial import TrialState
-from studies import GRACE, Clock
+from studies import GRACE, Clock, make_sweep
 from tunings import arguments, tuner_of
 
 from benchmark import tune
@@ -31,11 +31,45 @@ def test_further_seeds_and_methods_have_the_hyperparameters_of_the_first(ledger)
     # Of the same configuration, though none of these runs is in the study
     with pytest.raises(SweepError, match=r"'study': hyperparams: was .* and is now .*'gamma': 0\.5.* for Good.*--study"):
         open_ledger(ledger.storage, Clock(), seeds=[3, 4], hyperparams={"gamma": 0.5})
-    with pytest.raises(SweepError, match=r"'study': --set: was not given and is now \{'gamma': 0\.5\}.*--study"):
-        open_ledger(ledger.storage, Clock(), methods=["Other"], changes=["hyperparams {'gamma': 0.5}"])
     assert len(ledger.trials()) == 3
-    # Other changes do not name hyperparameters
-    open_ledger(ledger.storage, Clock(), seeds=4, changes=["evaluation_episodes 1"])
+    open_ledger(ledger.storage, Clock(), seeds=4)
+    assert len(ledger.trials()) == 4
+
+
+AXIS = {"noise": {"values": [0.1], "sets": {"noise_std": "$value"}}}
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "message"),
+    [
+        ({}, dict(hyperparams={"gamma": 0.5}), r"hyperparams\.gamma: was 'not given' and is now 0\.5"),
+        (dict(hyperparams={"gamma": 0.5}), {}, r"hyperparams\.gamma: was 0\.5 and is now 'not given'"),
+        (dict(hyperparams={"a": 1, "b": "x; y"}), dict(hyperparams={"a": 1, "b": "x; z"}), "hyperparams.b: was 'x; y' .*x; z"),
+        (dict(axes=AXIS), dict(axes={"noise": AXIS["noise"] | {"sets": {"tau": "$value"}}}), r"axes\.noise: was .*noise.*tau"),
+        (
+            dict(axes={"noise": {"values": {"some": {"gamma": 0.5}}}}),
+            dict(axes={"noise": {"values": {"some": {"gamma": 0.6}}}}),
+            r"axes\.noise: was .*0\.5.* and is now .*0\.6",
+        ),
+    ],
+)  # fmt: skip
+def test_further_methods_have_what_all_methods_have_in_common(before, now, message):
+    """Though no run of theirs is in the study, with which they could be compared."""
+    storage = InMemoryStorage()
+    ledger = open_ledger(storage, Clock(), **before)
+    n_trials = len(ledger.trials())
+    with pytest.raises(SweepError, match=f"'study': {message}.*--study"):
+        open_ledger(storage, Clock(), methods=["Other"], **now)
+    assert len(ledger.trials()) == n_trials
+    open_ledger(storage, Clock(), methods=["Other"], **before)
+    assert len(ledger.trials()) == 2 * n_trials
+
+
+def test_a_study_of_an_earlier_version_gets_further_methods():
+    storage = InMemoryStorage()
+    ledger = Ledger(storage, "study")
+    ledger.open(make_sweep(["Good"]), {"experiment": "tiny"})
+    open_ledger(storage, Clock(), methods=["Other"], seeds=2)
     assert len(ledger.trials()) == 4
 
 

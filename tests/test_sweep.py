@@ -343,6 +343,9 @@ def test_runs_of_other_settings_are_not_adopted(tmp_path, ledger):
         sweep, _ = of_command_line(*SMALL, *option, "--eval-interval", "20", "--results", str(tmp_path))
         with pytest.raises(SweepError, match=key):
             ended_runs(folder, describe(sweep, [], "cpu"))
+    other, _ = of_command_line(*SMALL[:-2], "--methods", "SAC", "--set", "gamma=0.5", "--results", str(tmp_path))
+    with pytest.raises(SweepError, match=r"hyperparams\.gamma: was 'not given' and is now 0\.5, .* cannot be adopted"):
+        ended_runs(folder, describe(other, [], "cpu"))
     assert ended_runs(tmp_path / "nothing", {}) == ([], [])
 
 

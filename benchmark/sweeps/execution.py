@@ -19,6 +19,7 @@ from benchmark.sweeps.progress import ProgressTracker, display
 from benchmark.sweeps.runs import overview
 from benchmark.sweeps.signals import end_if_asked
 from benchmark.sweeps.studies import Ledger
+from benchmark.sweeps.study_trials import SHARED
 from benchmark.sweeps.worker_loop import forget_ended
 
 
@@ -44,6 +45,7 @@ def describe(sweep: Sweep, argv: Sequence[str], device: str, threads: int = 1) -
         "evaluation_interval": file.evaluation_interval,
         "evaluation_episodes": file.evaluation_episodes,
         "settings_in_words": "; ".join(sweep.changes),
+        SHARED: sweep.shared,
         **overview(sweep.runs(), sweep.methods, file.tasks),
         "commands": [command],
     }

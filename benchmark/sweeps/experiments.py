@@ -5,6 +5,7 @@ A file's keys are the fields of :class:`~benchmark.sweeps.sweep_files.SweepFile`
 """
 
 import itertools
+import json
 import math
 import re
 import sys
@@ -54,6 +55,12 @@ class Sweep:
     def seeds(self) -> list[int]:
         """The seeds."""
         return list(range(self.file.seeds)) if isinstance(self.file.seeds, int) else self.file.seeds
+
+    @property
+    def shared(self) -> dict[str, dict[str, Any]]:
+        """What all methods have in common, as JSON has it: the hyperparameters of all, and what the axes set."""
+        axes = {name: axis.model_dump() for name, axis in self.file.axes.items()}
+        return json.loads(json.dumps({"hyperparams": self.file.hyperparams, "axes": axes}))
 
     def runs(self) -> list[Run]:
         """
@@ -132,6 +139,24 @@ class Sweep:
             if warm_up and warm_up.items() <= run.hyperparams.items():
                 return warm_up
         return {}
+
+
+def difference(was: dict[str, dict[str, Any]] | None, now: dict[str, dict[str, Any]]) -> tuple[str, str] | None:
+    """
+    Find what methods have in common now, and had not before.
+
+    :param was: :attr:`Sweep.shared` of an earlier command; None if it was not recorded
+    :param now: the same of this command
+    :return: the first key that differs, and how; None if none does
+    """
+    if was is None:
+        return None
+    for part in now:
+        for key in {**was[part], **now[part]}:
+            before, after = was[part].get(key, "not given"), now[part].get(key, "not given")
+            if before != after:
+                return f"{part}.{key}", f"was {before!r} and is now {after!r}"
+    return None
 
 
 def find_sweep_file(name: str) -> Path:

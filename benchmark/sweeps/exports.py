@@ -10,8 +10,9 @@ from optuna.trial import TrialState
 from benchmark.common.files import write_json
 from benchmark.common.provenance import processors_of_commands
 from benchmark.common.records import REWRITE, RUNS, STUDY, Record, read_description, read_records, write_records
+from benchmark.sweeps.experiments import difference
 from benchmark.sweeps.storages import open_storage
-from benchmark.sweeps.study_trials import owned
+from benchmark.sweeps.study_trials import SHARED, owned
 from benchmark.sweeps.study_view import StudyView
 from benchmark.sweeps.validation import SweepError
 
@@ -96,6 +97,8 @@ def ended_runs(folder: Path, description: dict[str, Any]) -> tuple[list[Record],
             same = was[key] == now
         if not same:
             raise SweepError(folder / STUDY, key, "differs from the sweep's, so that its runs cannot be adopted")
+    if found := difference(was.get(SHARED), description[SHARED]):
+        raise SweepError(folder / STUDY, found[0], f"{found[1]}, so that its runs cannot be adopted")
     used = processors_of_commands(was["commands"])
     # Earlier versions recorded the machines of the commands only
     known = used if len(used) == 1 else []

@@ -30,7 +30,7 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from benchmark.common.records import Record
-from benchmark.sweeps.experiments import Sweep
+from benchmark.sweeps.experiments import Sweep, difference
 from benchmark.sweeps.heartbeats import PROGRESS, SilenceDetector, TrialLostError
 from benchmark.sweeps.runs import Run
 from benchmark.sweeps.storages import patiently
@@ -43,6 +43,7 @@ from benchmark.sweeps.study_trials import (
     POPULATION,
     PROCESSORS,
     RUN,
+    SHARED,
     STOPPED,
     SWEEP,
     TUNING,
@@ -56,9 +57,6 @@ from benchmark.sweeps.study_trials import (
 )
 from benchmark.sweeps.trial_writer import TrialWriter
 from benchmark.sweeps.validation import SweepError
-
-# The beginning of the hyperparameters of all methods among a sweep's changes
-SET = "hyperparams "
 
 
 class Ledger(TrialWriter):
@@ -94,12 +92,14 @@ class Ledger(TrialWriter):
         if TUNING in attributes:
             raise self._refusal("", "holds the trials of a tuning")
         self.refuse_unresolved()
-        self._check_changes(sweep, attributes.get(SWEEP))
         self._distributions = distributions_of(sweep)
         if trials and trials[0].distributions == with_seed(self._distributions):
             # Optuna gives all trials of a study the same parameters
             self._distributions = with_seed(self._distributions)
         self._check(runs, trials)
+        # Other methods than those of the runs
+        if found := difference(attributes.get(SWEEP, {}).get(SHARED), sweep.shared):
+            raise self._refusal(*found)
         commands = description.get("commands", [])
         facts = {key: value for key, value in description.items() if key != "commands"}
         patiently(self.storage.set_study_user_attr, self.study_id, SWEEP, facts)
@@ -134,15 +134,6 @@ class Ledger(TrialWriter):
             before, after = trials[0].user_attrs[RUN][name], getattr(runs[0], name)
             if before != after:
                 raise self._refusal(name, f"was {before!r} and is now {after!r}")
-
-    def _check_changes(self, sweep: Sweep, description: dict[str, Any] | None) -> None:
-        """Refuse other hyperparameters of all methods than those of earlier commands, whose methods may be others."""
-        if description is None:
-            return
-        now = next((change for change in sweep.changes if change.startswith(SET)), "")
-        _, found, was = description.get("settings_in_words", "").partition(SET)
-        if f"{found}{was}".split("; ")[0] != now.split("; ")[0]:
-            raise self._refusal("--set", f"was {was or 'not given'} and is now {now.removeprefix(SET) or 'not given'}")
 
     def _refusal(self, key: str, problem: str) -> SweepError:
         return SweepError(f"The study {self.name!r}", key, f"{problem}. Choose another name by --study")

@@ -14,6 +14,8 @@ from benchmark.sweeps.runs import Run
 
 # Attributes of a study: its description, and the prefix of those that each record a command that trained runs
 SWEEP, COMMAND = "sweep", "command "
+# The key of a description with what all methods have in common; studies of earlier versions lack it
+SHARED = "shared"
 # The attribute of a tuning's study, which has other trials: its settings
 TUNING = "tuning"
 # Attributes of a trial
