@@ -252,6 +252,8 @@ def test_three_of_four_variants_are_equal_if_the_fourth_is_lower_by_more_than_co
     found = find("upper quartiles", records)
     assert found.verdict == verdict
     assert [part.verdict for part in found.parts] == [SUPPORTED] * 3 + [verdict] * 3
+    # What counts as none, in returns
+    assert {part.note for part in found.parts} == {"0.05 of the range is 5.00 on Pendulum-v1"}
 
 
 @pytest.mark.parametrize(

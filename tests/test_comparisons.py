@@ -232,6 +232,9 @@ def test_one_task_is_not_all_tasks(tmp_path: Path) -> None:
     assert differences_table(score_table([chosen]), ["TD3", "SAC"]) == ""
 
 
+NO_LOSS = "No loss of more than 5% of a task's range"
+
+
 def compared(folder: Path, light: dict[str, float], seeds: int = 4, spread: float = 1.0) -> str:
     """
     Write a study in which the paper's setting scores 50 on each task, in a range from 0 to 100, and the light one so.
@@ -256,17 +259,19 @@ def test_losses_are_named_with_their_tasks(tmp_path: Path) -> None:
     assert "not distinguishable on Pusher-v5 (sweep, 1,000 steps), which is no proof" in text
     assert f"losses of up to {half:.0f}% of a task's range, on Pusher-v5" in text
     assert f"| Hopper-v5 (sweep, 1,000 steps) | -30.00 ({-30 - half:.2f} to {-30 + half:.2f}) | lower |" in text
-    assert "| higher | 0% | 4 |" in text
+    assert "| higher | 0.00 (0%) | 4 |" in text
+    # In returns, too
+    assert f"| lower | {30 + half:.2f} ({30 + half:.0f}%) | 4 |" in text
 
 
 @pytest.mark.parametrize(
     ("light", "answer", "higher"),
     [
         # The interval reaches 4.47 to both sides: the largest losses in it are 4.47, 4.97 and 5.07 % of the range
-        ({"Hopper-v5": 50.0}, "No", 0),
-        ({"Hopper-v5": 49.5}, "No", 0),
+        ({"Hopper-v5": 50.0}, NO_LOSS, 0),
+        ({"Hopper-v5": 49.5}, NO_LOSS, 0),
         ({"Hopper-v5": 49.4}, "Not decided", 0),
-        ({"Hopper-v5": 49.5, "Ant-v5": 70.0}, "No", 1),
+        ({"Hopper-v5": 49.5, "Ant-v5": 70.0}, NO_LOSS, 1),
         ({"Hopper-v5": 49.4, "Ant-v5": 70.0}, "Not decided", 1),
     ],
 )
@@ -286,7 +291,7 @@ def test_each_experiment_has_its_own_answer(tmp_path: Path) -> None:
         studies.append(study(tmp_path, records, name))
         studies[-1].facts["experiment"] = name
     text = unpadded(light_section(studies))
-    assert "In E1: **No: of 1 tasks" in text
+    assert f"In E1: **{NO_LOSS}: of 1 tasks" in text
     assert "In E10: **Yes, on Pendulum-v1 (e10-quick, 1,000 steps) by 30.00" in text
     assert text.count("| Pendulum-v1 (e1, 1,000 steps) |") == text.count("| Pendulum-v1 (e10-quick, 1,000 steps) |") == 1
 
@@ -310,7 +315,7 @@ def test_failed_runs_are_counted_beside_the_answer(tmp_path: Path) -> None:
     text = with_failures(tmp_path / "some", {"CGP-Light": 2, "CGP-Online": 0}, [10.0])
     assert "**Runs failed:** 2 of CGP-Light and 0 of CGP-Online on Pendulum-v1 (sweep, 1,000 steps); they count with" in text
     # The interval of three runs at 50 and two at 0 reaches below the task's range, whose best is that of Online's last run
-    assert "| not distinguishable | 100% | 5 |" in text
+    assert "(-56.22 to 15.82) | not distinguishable | 56.22 (100%) | 5 |" in text
     assert "failed" not in with_failures(tmp_path / "none", {"CGP-Light": 0, "CGP-Online": 0}, [])
 
 
@@ -330,7 +335,7 @@ def test_a_small_loss_is_given_as_a_share_of_the_range(loss: float, percent: str
     records += [record("CGP-Light", seed, 50.0 - loss) for seed in range(4)]
     text = unpadded(light_section([study(tmp_path, records)]))
     assert f"), {percent} of the task's range.**" in text
-    assert f"| lower | {percent} | 4 |" in text
+    assert f"| lower | {loss:.2f} ({percent}) | 4 |" in text
 
 
 def test_tasks_that_one_of_them_lacks_and_studies_that_do_not_compare_them(tmp_path: Path) -> None:

@@ -145,7 +145,7 @@ def imitation(table: pd.DataFrame, repetitions: int) -> list[Part]:
     if found is None:
         return []
     text = _in_words("interquartile mean", table, (OURS, IMITATED), interquartile_mean, found)
-    return [Part(text, judge(found, more_than=-MARGIN))]
+    return [Part(text, judge(found, more_than=-MARGIN), _margin_in_words(table, (OURS, IMITATED)))]
 
 
 def inference_cost(runtime: dict[str, Any] | None, repetitions: int) -> list[Part]:
@@ -226,13 +226,21 @@ def _differences(
         found = compare(common, pair, lambda ours, theirs: statistic(ours) - statistic(theirs), repetitions=repetitions)
         if found is not None:
             text = _in_words(name, common, pair, statistic, found)
-            parts.append(Part(text, judge(found, **bounds)))
+            note = _margin_in_words(common, pair) if MARGIN in map(abs, bounds.values()) else ""
+            parts.append(Part(text, judge(found, **bounds), note))
     return parts
 
 
 def _in_words(name: str, table: pd.DataFrame, pair: tuple[str, str], statistic: Statistic, found: Estimate) -> str:
     ours, theirs = _each(table, pair, statistic)
     return f"{name} of {pair[0]} {ours:.3f}, of {pair[1]} {theirs:.3f}: {_signed(found, 'higher', 'lower')}"
+
+
+def _margin_in_words(table: pd.DataFrame, pair: tuple[str, str]) -> str:
+    """Return the margin of a verdict in returns, on each task that is compared."""
+    ranges = in_common(table, pair).groupby("task", sort=False)["range"].first()
+    margins = [f"{MARGIN * width:,.{0 if MARGIN * width >= 100 else 2}f} on {task}" for task, width in ranges.items()]
+    return f"{MARGIN:g} of the range is {', '.join(margins)}"
 
 
 def _signed(found: Estimate, more: str, less: str, form: str = ".3f") -> str:

@@ -18,8 +18,9 @@ from benchmark.reporting.verdicts import LIGHT, MARGIN, OURS
 
 PAIR = (LIGHT, OURS)
 RULE = f"""\
-*Yes* names the tasks on which the whole interval of the difference is below 0. *No* means that no task's interval contains a
-loss of more than {MARGIN:.0%} of the task's range. Everything else is *not decided*."""
+*Yes* names the tasks on which the whole interval of the difference is below 0. *No loss of more than {MARGIN:.0%}* means that
+no task's interval contains one, as a share of the task's range, which begins at the lowest return of any evaluation, often
+below random actions: the tables have the losses in returns, too. Everything else is *not decided*."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,13 @@ class Comparison:
     def largest_loss(self) -> float | None:
         """The largest loss within the interval, as a share of the task's range; None without an interval."""
         return None if self.share.interval is None else min(max(0.0, -self.share.interval[0]), 1.0)
+
+    @property
+    def largest_loss_in_words(self) -> str:
+        """The same in returns, and as a share of the task's range."""
+        if self.reward.interval is None:
+            return "-"
+        return f"{max(0.0, -self.reward.interval[0]):{self.form}} ({_percent(self.largest_loss)})"
 
 
 def light_section(studies: Sequence[Study]) -> str:
@@ -93,10 +101,10 @@ def _compare(studies: Sequence[Study]) -> tuple[list[Comparison], list[str]]:
 
 def _table(compared: Sequence[Comparison]) -> str:
     """Tabulate the comparisons, in Markdown."""
-    loss = "largest loss in the interval, of the task's range"
+    loss = "largest loss in the interval (of the task's range)"
     header = ["task", f"{LIGHT} − {OURS} (95 % interval)", f"{LIGHT} is", loss, "seeds"]
     rows = [
-        [each.place, each.reward.in_words(each.form), each.word, _percent(each.largest_loss), str(each.reward.runs)]
+        [each.place, each.reward.in_words(each.form), each.word, each.largest_loss_in_words, str(each.reward.runs)]
         for each in compared
     ]
     return markdown_table(header, rows)
@@ -126,7 +134,7 @@ def answer(compared: Sequence[Comparison], missing: Sequence[str]) -> str:
     elif decided:
         higher = sum(each.word == HIGHER for each in decided)
         is_no = len(decided) == total and all(each.shows_no_loss for each in decided)
-        answer_word = "No" if is_no else "Not decided"
+        answer_word = f"No loss of more than {MARGIN:.0%} of a task's range" if is_no else "Not decided"
         counted = f"higher on {higher}, lower on none, and not distinguishable on {len(decided) - higher}"
         sentences = [f"**{answer_word}: of {total} tasks, {LIGHT} is {counted}.**"]
     else:

@@ -208,8 +208,8 @@ def score_table(studies: Sequence[Study]) -> pd.DataFrame:
 
     :param studies: the studies
     :return: a row per run: study, method, task (with the steps where runs on it differ in them), settings, cell (what it
-        shares with the runs that differ from it in method and seed only), seed, failed, score, and share (the score, with
-        0 for the task's lowest return of any evaluation, and 1 for its best score)
+        shares with the runs that differ from it in method and seed only), seed, failed, score, floor (the task's lowest
+        return of any evaluation), range (from the floor to the task's best score), and share (of the range, from the floor)
     """
     runs = [(study.name, record) for study in studies for record in study.in_order()]
     lowest = floors(record for _, record in runs)
@@ -237,8 +237,8 @@ def score_table(studies: Sequence[Study]) -> pd.DataFrame:
     columns = ["study", "method", "task", "settings", "values", "cell", "seed", "failed", "score", "floor"]
     table = pd.DataFrame(rows, columns=columns)
     height = table["score"] - table["floor"]
-    best = height.groupby(table["task"]).transform("max")
-    table["share"] = (height / best.where(best > 0)).fillna(0.0).astype(float)
+    table["range"] = height.groupby(table["task"]).transform("max")
+    table["share"] = (height / table["range"].where(table["range"] > 0)).fillna(0.0).astype(float)
     return table
 
 
