@@ -15,7 +15,7 @@ from benchmark.common.records import Record
 from benchmark.reporting.claims import best_or_second, equal_variants, findings
 from benchmark.reporting.figures import figures
 from benchmark.reporting.scores import read_study, score_table
-from benchmark.reporting.verdicts import CONTRADICTED, NO_DATA, NOT_DECIDED, SUPPORTED, Finding
+from benchmark.reporting.verdicts import CONTRADICTED, NO_DATA, NOT_DECIDED, SUPPORTED, TOO_FEW, Finding
 
 SWEPT = [{"width": 32}, {"width": 64}]
 VARIANTS = ["CGP-Online", "CGP-Offline", "QGP-Online", "QGP-Offline"]
@@ -87,6 +87,21 @@ def test_second_best_by_little_on_many_tasks_is_not_contradicted(find: Any) -> N
     found = find("best or second", records)
     assert len(found.parts) == len(tasks)
     assert found.verdict == NOT_DECIDED
+
+
+@pytest.mark.parametrize(("level", "verdict"), [(80, NOT_DECIDED), (20, CONTRADICTED)])
+def test_an_unfinished_task_has_no_rank_and_is_not_counted(find: Any, level: float, verdict: str) -> None:
+    """It comes first in the study, and would be the evidence."""
+    methods = ["CGP-Online", "TD3", "SAC"]
+    unfinished = runs(scores(CGP_Online=20, TD3=40, SAC=80), methods, tasks=["Ant-v5"], seeds=range(3))
+    whole = runs(scores(CGP_Online=level, TD3=40, SAC=50), methods, tasks=["Pendulum-v1", "Reacher-v5"])
+    found = find("best or second", unfinished + whole)
+    assert [part.verdict for part in found.parts] == [SUPPORTED if level == 80 else CONTRADICTED] * 2 + [TOO_FEW]
+    assert found.verdict == verdict
+    text = "Ant-v5, of which only 3 of CGP-Online, 3 of SAC, 3 of TD3 have ended"
+    assert found.parts[-1].text == text
+    counted = f"rank 3 of 3 on Pendulum-v1, higher than 0 and lower than 2 of 2 rivals; {CONTRADICTED} in 2 of 2 comparisons"
+    assert found.evidence == (text if level == 80 else counted)
 
 
 def test_ranks_are_within_a_study(tmp_path: Path) -> None:

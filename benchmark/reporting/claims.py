@@ -21,7 +21,7 @@ from benchmark.reporting.estimates import (
     interquartile_range,
 )
 from benchmark.reporting.failures import FAILURE, HIGH_LEARNING_RATE, few_steps_fail, has_high_rate, high_rate_fails
-from benchmark.reporting.verdicts import CONTRADICTED, MARGIN, NOT_DECIDED, OURS, SUPPORTED, Finding, Part, judge
+from benchmark.reporting.verdicts import CONTRADICTED, MARGIN, NOT_DECIDED, OURS, SUPPORTED, TOO_FEW, Finding, Part, judge
 
 FAMILY = ("CGP-Online", "CGP-Offline", "QGP-Online", "QGP-Offline")
 IMITATED = "CEM"
@@ -35,19 +35,19 @@ COST_MARGIN = 0.1
 
 RULES = f"""\
 Rewards are compared as shares of their task's range, from 0 for the lowest return of any evaluation to 1 for the best final
-reward, and averaged over tasks, without those on which all returns are the same. Methods are compared on the configurations
-that all of them ran. A claim is *{SUPPORTED}*
-or *{CONTRADICTED}* if the whole 95 % interval lies on its side or on the other, *{NOT_DECIDED}* if not, or if a method or a
-configuration has fewer than {FEWEST_RUNS} runs; of several parts, all must be supported, and one is enough to contradict.
-The intervals are those of *How to read this page*, which few seeds make too narrow. The interquartile range, which measures
-what the paper calls spread, is that of final rewards over all configurations and seeds: it is 0 for a method that always
-fails, too, so read it with the stability curve. *At least as good*
-and *equal* allow {MARGIN:g} of the range, so that a variant is *lower* than others by more than this; *independent* allows
-{COST_MARGIN:.0%}. *Fails* means that the mean loses
+reward, and averaged over tasks, without those on which all returns are the same; a task at two numbers of steps counts as two
+tasks. Configurations with more runs weigh more. Methods are compared on the configurations that all of them ran. A claim is
+*{SUPPORTED}* or *{CONTRADICTED}* if the whole 95 % interval lies on its side or on the other, *{NOT_DECIDED}* if not, or if a
+method or a configuration has fewer than {FEWEST_RUNS} runs; of several parts, all must be supported, and one is enough to
+contradict. The intervals are those of *How to read this page*, which few seeds make too narrow. The interquartile range, which
+measures what the paper calls spread, is that of final rewards over all configurations and seeds: it is 0 for a method that
+always fails, too, so read it with the stability curve. *At least as good* and *equal* allow {MARGIN:g} of the range, so that a
+variant is *lower* than others by more than this; *independent* allows {COST_MARGIN:.0%}. *Fails* means that the mean loses
 {FAILURE:g} of the range against the best of the other values, chosen by these data, where all else is equal. "Best or second
-best" is among {OURS} and all methods but its variants, {IMITATED} and {RANDOM}, in studies that vary no hyperparameter,
-on each task by itself: *{SUPPORTED}* if {OURS} is higher than all rivals but one, *{CONTRADICTED}* if it is lower than two, by
-the intervals of the tables of differences. E10, whose tasks are not the paper's, does not count for any claim."""
+best" is among {OURS} and all methods but its variants, {IMITATED} and {RANDOM}, in studies that vary no hyperparameter, on
+each task by itself: *{SUPPORTED}* if {OURS} is higher than all rivals but one, *{CONTRADICTED}* if it is lower than two, by
+the intervals of the tables of differences; a task with fewer than {FEWEST_RUNS} runs of one of them has *{TOO_FEW}*. E10,
+whose tasks are not the paper's, does not count for any claim."""
 
 
 def findings(table: pd.DataFrame, runtime: dict[str, Any] | None, repetitions: int = REPETITIONS) -> list[Finding]:
@@ -86,23 +86,32 @@ def best_or_second(table: pd.DataFrame) -> list[Part]:
     Test whether at most one rival is better: by the differences from all rivals.
 
     :param table: the scores of runs that vary no hyperparameter
-    :return: a part for each task of each study that has two rivals
+    :return: a part for each task of each study that has two rivals, those with too few runs last
     """
     parts = []
     for _, runs in table.groupby("cell", sort=False):
         rivals = sorted(method for method in set(runs["method"]) - {IMITATED, RANDOM} if not method.startswith(VARIANTS))
         if OURS in set(runs["method"]) and len(rivals) >= 2:
-            task = runs["task"].iloc[0]
-            leads = [task_difference(runs, task, (OURS, rival), "share") for rival in rivals]
-            verdicts = [NOT_DECIDED if lead is None else judge(lead, more_than=0) for lead in leads]
-            means = _each(runs, (OURS, *rivals), lambda scores: scores.mean(axis=1))
-            rank = 1 + sum(mean > means[0] for mean in means[1:])
-            higher, lower = verdicts.count(SUPPORTED), verdicts.count(CONTRADICTED)
-            verdict = SUPPORTED if higher >= len(rivals) - 1 else CONTRADICTED if lower >= 2 else NOT_DECIDED
-            counted = f"higher than {higher} and lower than {lower} of {len(rivals)} rivals"
-            decided = counted if higher or lower else f"not distinguishable from any of {len(rivals)} rivals"
-            parts.append(Part(f"rank {rank} of {len(means)} on {task}, {decided}", verdict))
-    return parts
+            parts.append(_rank(runs, rivals))
+    return sorted(parts, key=lambda part: part.verdict == TOO_FEW)
+
+
+def _rank(runs: pd.DataFrame, rivals: Sequence[str]) -> Part:
+    """Compare CGP with its rivals on a task."""
+    task, methods = runs["task"].iloc[0], (OURS, *rivals)
+    numbers = {method: int((runs["method"] == method).sum()) for method in methods}
+    if min(numbers.values()) < FEWEST_RUNS:
+        ended = ", ".join(f"{number} of {method}" for method, number in numbers.items())
+        return Part(f"{task}, of which only {ended} have ended", TOO_FEW)
+    leads = [task_difference(runs, task, (OURS, rival), "share") for rival in rivals]
+    verdicts = [NOT_DECIDED if lead is None else judge(lead, more_than=0) for lead in leads]
+    means = _each(runs, methods, lambda scores: scores.mean(axis=1))
+    rank = 1 + sum(mean > means[0] for mean in means[1:])
+    higher, lower = verdicts.count(SUPPORTED), verdicts.count(CONTRADICTED)
+    verdict = SUPPORTED if higher >= len(rivals) - 1 else CONTRADICTED if lower >= 2 else NOT_DECIDED
+    counted = f"higher than {higher} and lower than {lower} of {len(rivals)} rivals"
+    decided = counted if higher or lower else f"not distinguishable from any of {len(rivals)} rivals"
+    return Part(f"rank {rank} of {len(means)} on {task}, {decided}", verdict)
 
 
 def narrower(table: pd.DataFrame, repetitions: int) -> list[Part]:

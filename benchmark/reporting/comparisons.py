@@ -19,11 +19,11 @@ from benchmark.reporting.estimates import (
     probability_of_improvement,
 )
 from benchmark.reporting.scores import Study, by_family, score_table
-from benchmark.reporting.verdicts import LIGHT, OURS
+from benchmark.reporting.verdicts import LIGHT, OURS, TOO_FEW
 
 RANDOM = "Random"
 HEADER = ["task", "difference", "of means (95 % interval)", "the first is", "runs"]
-HIGHER, LOWER, NOT_DISTINGUISHABLE, TOO_FEW = "higher", "lower", "not distinguishable", "too few seeds"
+HIGHER, LOWER, NOT_DISTINGUISHABLE = "higher", "lower", "not distinguishable"
 DIFFERENCES_RULE = f"""\
 In tables of differences, each row has the first method's mean final reward less the second's. The intervals of single tasks
 are Welch's t intervals: with 4 runs each, these contain the true difference in 96 % of the cases on normally distributed

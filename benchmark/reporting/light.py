@@ -8,13 +8,12 @@ from benchmark.reporting.comparisons import (
     HIGHER,
     LOWER,
     NOT_DISTINGUISHABLE,
-    TOO_FEW,
     difference_in_words,
     task_difference,
 )
 from benchmark.reporting.estimates import FEWEST_RUNS, Estimate, number_format
 from benchmark.reporting.scores import Study, by_family, score_table
-from benchmark.reporting.verdicts import LIGHT, MARGIN, OURS
+from benchmark.reporting.verdicts import LIGHT, MARGIN, OURS, TOO_FEW
 
 PAIR = (LIGHT, OURS)
 RULE = f"""\

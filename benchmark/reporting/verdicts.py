@@ -14,6 +14,8 @@ LIGHT = "CGP-Light"
 SHOWN_FIRST = (OURS, LIGHT, "TD3", "SAC")
 SUPPORTED, CONTRADICTED = "supported", "contradicted"
 NOT_DECIDED, NO_DATA = "not decided by these data", "no data"
+# Of a comparison of which nothing is concluded yet
+TOO_FEW = "too few seeds"
 # The difference that counts as none, as a share of the task's range
 MARGIN = 0.05
 
@@ -63,11 +65,13 @@ class Finding:
     @property
     def evidence(self) -> str:
         """The comparison that the verdict rests on: of several, the first with the verdict of all together."""
-        if not self.parts:
-            return ""
-        deciding = next(part for part in self.parts if part.verdict == self.verdict)
-        alike = sum(part.verdict == self.verdict for part in self.parts)
-        return deciding.text + f"; {self.verdict} in {alike} of {len(self.parts)} comparisons" * (len(self.parts) > 1)
+        with_seeds = [part for part in self.parts if part.verdict != TOO_FEW]
+        alike = [part for part in with_seeds if part.verdict == self.verdict]
+        if not alike:
+            # Where the others are supported, those with too few seeds leave the claim undecided
+            return next((part.text for part in self.parts if part.verdict == TOO_FEW), "")
+        counted = f"; {self.verdict} in {len(alike)} of {len(with_seeds)} comparisons"
+        return alike[0].text + counted * (len(with_seeds) > 1)
 
     @property
     def text(self) -> str:
