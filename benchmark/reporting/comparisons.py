@@ -30,9 +30,9 @@ are Welch's t intervals: with 4 runs each, these contain the true difference in 
 rewards, and in 95 % where one standard deviation is three times the other; a percentile bootstrap does in 84 %. Where a
 quarter of the runs collapses by 10 standard deviations, they contain it in 98 % of the cases if runs of both methods do, but
 in 74 % if those of one method alone do, of whose 4 runs none collapses in a third of the cases. The rows on all tasks have
-means over the tasks with {FEWEST_RUNS} or more runs of both methods, of rewards as shares of each task's range, from 0 for
-the lowest return of any evaluation to 1 for the best final reward, with the same t intervals (96 % of the cases with 4 runs on
-each of 5 tasks).
+means over the tasks with {FEWEST_RUNS} or more runs of both methods, each with the same weight, and twice if it was run with
+two numbers of steps, of rewards as shares of each task's range, from 0 for the lowest return of any evaluation to 1 for the
+best final reward, with the same t intervals (96 % of the cases with 4 runs on each of 5 tasks).
 *{NOT_DISTINGUISHABLE.capitalize()}* means that the interval contains 0, which is no proof that the methods are equal; with
 fewer than {FEWEST_RUNS} runs of a method, nothing is concluded. One in twenty intervals misses the true difference by chance,
 and no correction is made for their number."""
