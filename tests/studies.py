@@ -4,12 +4,11 @@ import random
 import threading
 import time
 from collections import Counter
-from contextlib import nullcontext
 from types import SimpleNamespace
 
 from optuna.trial import TrialState
 
-from benchmark.sweeps import storages
+from benchmark.sweeps import locks, storages
 from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.experiments import Sweep
 from benchmark.sweeps.runs import Run
@@ -91,7 +90,7 @@ def pretend(monkeypatch, clock):
     monkeypatch.setattr(worker, "train", pretend_to_train)
     monkeypatch.setattr(worker, "train_group", pretend_to_train_group)
     monkeypatch.setattr(worker, "HeartbeatThread", Heart)
-    monkeypatch.setattr(worker, "FileLock", lambda path: nullcontext())
+    monkeypatch.setattr(locks, "FileLock", lambda path: SimpleNamespace(acquire=lambda timeout: None, release=lambda: None))
     times = SimpleNamespace(sleep=clock.sleep, monotonic=clock, strftime=time.strftime)
     monkeypatch.setattr(worker, "time", times)
     monkeypatch.setattr(storages, "time", times)

@@ -9,6 +9,7 @@ from optuna.storages import InMemoryStorage
 from optuna.trial import TrialState
 from studies import Crew, assert_each_run_once, make_sweep, mortal, pretend_to_train, pretend_to_train_group, work_through
 
+from benchmark.sweeps import locks
 from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.groups import Group
 from benchmark.sweeps.run import begin
@@ -113,14 +114,14 @@ def test_states_are_removed_before_another_process_may_continue_from_them(clock,
         def __init__(self, path):
             events.append("locked")
 
-        def __enter__(self):
+        def acquire(self, timeout):
             pass
 
-        def __exit__(self, *exception):
+        def release(self):
             events.append("released")
 
     forget = worker._forget
-    monkeypatch.setattr(worker, "FileLock", Lock)
+    monkeypatch.setattr(locks, "FileLock", Lock)
     monkeypatch.setattr(worker, "_forget", lambda *args: events.append("removed") or forget(*args))
     work_through(InMemoryStorage(), make_sweep(["Good"]), clock, tmp_path, population=8)
     assert events == ["locked", "locked", "removed", "released", "released"]

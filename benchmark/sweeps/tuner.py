@@ -12,7 +12,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 import optuna
-from filelock import FileLock
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.samplers import TPESampler
 from optuna.storages import BaseStorage
@@ -20,6 +19,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from benchmark.sweeps.attempts import MOST, SUSPECT, fruitless, in_words, outcome_of
 from benchmark.sweeps.heartbeats import HeartbeatThread, SilenceDetector, TrialLostError, send_beat
+from benchmark.sweeps.locks import locked
 from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, run_folder, train
 from benchmark.sweeps.scoring import PRUNERS, SCORING
 from benchmark.sweeps.signals import undisturbed
@@ -157,10 +157,8 @@ class Tuner:
             if seed == len(scores):
                 run = self._tuning.run(frozen, seed)
                 folder = run_folder(logs, self._study.study_name, run)
-                folder.mkdir(parents=True, exist_ok=True)
                 print(f"{time.strftime('%H:%M:%S')} {run.key}", flush=True)
-                # A process that was taken for lost may still write to the folder
-                with FileLock(folder / ".lock"):
+                with locked([folder]):
                     scores.append(train(run, folder, lambda step, value: None, heartbeat.watch, device))
                 patiently(trial.set_user_attr, SCORES, scores)
                 forget_states(folder)

@@ -4,11 +4,10 @@ import os
 import shutil
 import time
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
-from filelock import FileLock
 from stable_baselines3.common.utils import get_device
 
 from benchmark.common.provenance import machine, processor
@@ -16,6 +15,7 @@ from benchmark.sweeps.attempts import outcome_of
 from benchmark.sweeps.claimed_runs import ClaimedRuns
 from benchmark.sweeps.groups import FOLDER, GROUP_RUNS, Group, Groups
 from benchmark.sweeps.heartbeats import BEAT, HeartbeatThread, TrialLostError
+from benchmark.sweeps.locks import locked
 from benchmark.sweeps.population_run import train_group
 from benchmark.sweeps.processes import PAUSE
 from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, has_state, run_folder, train
@@ -79,7 +79,7 @@ def _train_claimed(
         try:
             claimed.annotate(PROCESSORS, [processor(machine(get_device(device)))])
             with HeartbeatThread(claimed.beat, beat, parent) as heartbeat:
-                locks.enter_context(_locked(folders))
+                locks.enter_context(locked(folders))
                 if group is None:
                     finals = {0: train(runs[0], folders[0], report, heartbeat.watch, device)}
                 else:
@@ -124,17 +124,6 @@ def _give_up(
 def _in_words(claims: Sequence[Claim], group: Group | None) -> str:
     keys = ", ".join(claim.run.key for claim in claims)
     return keys if group is None else f"population {group.folder.name} of {len(group.runs)}: {keys}"
-
-
-@contextmanager
-def _locked(folders: Sequence[Path]) -> Iterator[None]:
-    """Lock the folders of runs: a process that was taken for lost may still write to them."""
-    with ExitStack() as stack:
-        # All processes in the same order, so that no two wait for each other
-        for folder in sorted(folders):
-            folder.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(FileLock(folder / ".lock"))
-        yield
 
 
 def forget_ended(ledger: Ledger, logs: Path) -> None:

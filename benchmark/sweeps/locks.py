@@ -1,0 +1,30 @@
+"""Locks on the folders of runs: a process that was taken for lost may still write to them."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+
+@contextmanager
+def locked(folders: Sequence[Path]) -> Iterator[None]:
+    """
+    Lock folders within a ``with`` block, and say for which process it waits.
+
+    :param folders: the folders, which are created
+    """
+    with ExitStack() as stack:
+        # All processes in the same order, so that no two wait for each other
+        for folder in sorted(folders):
+            folder.mkdir(parents=True, exist_ok=True)
+            path = folder / ".lock"
+            lock = FileLock(path)
+            try:
+                lock.acquire(timeout=0)
+            except Timeout:
+                told = f"Waiting for the process that holds {path}, which may be suspended: `fuser {path}` names it"
+                print(told, flush=True)
+                lock.acquire()
+            stack.callback(lock.release)
+        yield

@@ -1,0 +1,39 @@
+"""The locks on the folders of runs."""
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from benchmark.sweeps.locks import locked
+
+HOLD = """\
+import sys, time
+from pathlib import Path
+from benchmark.sweeps.locks import locked
+with locked([Path(sys.argv[1])]):
+    print("held", flush=True)
+    time.sleep(float(sys.argv[2]))
+"""
+
+
+@pytest.mark.parametrize("is_held", [False, True])
+def test_a_process_says_once_for_whom_it_waits(tmp_path, capsys, is_held):
+    folders = [tmp_path / name for name in ("b", "a")]
+    if is_held:
+        holder = subprocess.Popen([sys.executable, "-c", HOLD, str(folders[0]), "1.5"], stdout=subprocess.PIPE)
+        assert holder.stdout.readline() == b"held\n"
+    start = time.monotonic()
+    with locked(folders):
+        waited = time.monotonic() - start
+        if is_held:
+            assert holder.wait(timeout=10) == 0
+    path = tmp_path / "b" / ".lock"
+    told = f"Waiting for the process that holds {path}, which may be suspended: `fuser {path}` names it\n"
+    assert capsys.readouterr().out == told * is_held
+    assert (waited > 0.5) == is_held
+    # They are free again
+    with locked(folders):
+        pass
+    assert "Waiting" not in capsys.readouterr().out
