@@ -80,6 +80,9 @@ def test_a_population_whose_environments_are_killed_goes_on_from_its_state(tmp_p
     with pytest.raises(error) as raised:
         execute_runs(ledger, tmp_path / "logs", "a process", device="cpu", population=8)
     assert getattr(raised.value, "code", 143) == 143
+    if how is signal.SIGKILL:
+        (population,) = (tmp_path / "logs").glob("tiny/populations/*")
+        assert f"from the beginning, remove {population}, and give --population" in str(raised.value)
     assert max(StateStore(next((tmp_path / "logs").glob("tiny/populations/*/state"))).steps()) >= 2 * 30
     monkeypatch.setattr(ending, "end", lambda now: None)
     execute_runs(ledger, tmp_path / "logs", "another process", device="cpu", population=8)

@@ -5,6 +5,7 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing import connection
+from pathlib import Path
 
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
@@ -39,10 +40,11 @@ def close_environments(env: VecEnv) -> None:
 
 
 @contextmanager
-def classified_deaths() -> Iterator[None]:
+def classified_deaths(population: Path) -> Iterator[None]:
     """
     Turn the death of an environment's process into an error that tells whether the runs are to blame.
 
+    :param population: the folder of the population, for the error's message
     :return: a context, in which the environments are used and not yet closed
     :raises SystemExit: if SIGTERM has ended the processes
     :raises ChildProcessError: if another signal from outside has ended a process, as for lack of memory
@@ -63,7 +65,11 @@ def classified_deaths() -> Iterator[None]:
         if cause == -signal.SIGTERM:
             print(f"{message}: the runs are given back", flush=True)
             raise SystemExit(TERMINATED) from error
-        raise ChildProcessError(f"{message}. Signal 9 is often for lack of memory: --population takes fewer runs") from error
+        raise ChildProcessError(
+            f"{message}. Signal 9 is often for lack of memory. A population keeps its size, and is divided into single runs "
+            "if this happens again and again at the same step. To train fewer runs together, from the beginning, remove "
+            f"{population}, and give --population"
+        ) from error
 
 
 def _exit_codes(error: BaseException) -> list[int]:

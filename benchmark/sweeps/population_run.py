@@ -51,7 +51,7 @@ def train_group(
     for run, folder in zip(group.runs, folders, strict=True):
         register_all(run)
         begin(run, folder)
-    with ExitStack() as environments, classified_deaths():
+    with ExitStack() as environments, classified_deaths(group.folder):
         try:
             experiments, population = _set_up(group, folders, claimed, device, environments)
         except NoStateLeftError as error:
