@@ -70,6 +70,44 @@ def test_evaluations_stand_at_their_share_of_the_time(tmp_path: Path, drawn: lis
     assert found["TD3"][1] == [10.0, 20.0, 30.0, 40.0]
 
 
+def test_random_steps_at_the_start_need_no_time(tmp_path: Path, drawn: list[Figure]) -> None:
+    configurations = {"TD3": {"learning_starts": 500}, "SAC,Pendulum-v1": {"learning_starts": 250}, "CGP-Online": {}}
+    records = [timed("TD3", 0, 8.0), timed("SAC", 0, 3.0), timed("CGP-Online", 0, 4.0)]
+    chosen = study(tmp_path, records, seeds=[0], configurations=configurations)
+    curves_by_minutes(chosen, "Pendulum-v1", 20)
+    found = lines(drawn[0].axes[0])
+    assert {name: pytest.approx(x) for name, (x, _) in found.items()} == {
+        "TD3": [0.0, 0.0, 4.0, 8.0], "SAC": [0.0, 1.0, 2.0, 3.0], "CGP-Online": [1.0, 2.0, 3.0, 4.0]
+    }  # fmt: skip
+    (trace,) = (each for each in interactive_lines(chosen) if each["name"] == "TD3")
+    assert trace == {"name": "TD3", "minutes": [0.0, 0.0, 4.0, 8.0]}
+
+
+def interactive_lines(chosen: Study) -> list[dict[str, object]]:
+    """Return what the button "by minutes" shows of each method's line."""
+    drawn = figure(chosen, "Pendulum-v1", 20)
+    _, by_minutes = drawn["layout"]["updatemenus"][0]["buttons"]
+    minutes = by_minutes["args"][0]["x"]
+    return [
+        {"name": trace["name"], "minutes": x}
+        for trace, x in zip(drawn["data"], minutes, strict=True)
+        if trace["meta"]["kind"] == "seed"
+    ]
+
+
+def test_offline_variants_have_no_minutes(tmp_path: Path, drawn: list[Figure]) -> None:
+    """Their time is that of the training after the last step, too."""
+    configurations = {"CGP-Offline": {"policy_training": "offline"}, "TD3": {}}
+    records = [timed("TD3", 0, 8.0), timed("CGP-Offline", 0, 9.0)]
+    chosen = study(tmp_path, records, seeds=[0], configurations=configurations)
+    curves_by_minutes(chosen, "Pendulum-v1", 20)
+    assert list(lines(drawn[0].axes[0])) == ["TD3"]
+    assert minutes_caption(chosen, "Pendulum-v1").endswith("after the last step: CGP-Offline.")
+    assert [len(line["minutes"]) for line in interactive_lines(chosen)] == [4, 0]  # type: ignore[arg-type]
+    alone = study(tmp_path, records[1:], configurations=configurations)
+    assert times_of(alone, "Pendulum-v1").runs == []
+
+
 def test_runs_without_a_time_are_left_out_with_a_note(tmp_path: Path) -> None:
     failing = replace(record("TD3", 3, None, returns=[10.0]), processor_seconds=1.0)
     hopeless = replace(record("DDPG", 0, None, returns=[10.0]), processor_seconds=1.0)

@@ -16,7 +16,7 @@ from benchmark.reporting.commands import FIGURES_ONLY, FOLDER, command_line, wit
 from benchmark.reporting.comparisons import experiments_section
 from benchmark.reporting.drawing import final_rewards, sensitivity, stability, values
 from benchmark.reporting.estimates import REPETITIONS
-from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, shown_methods, times_of
+from benchmark.reporting.learning_curves import curves_by_minutes, curves_by_steps, shown_methods, timed_methods, times_of
 from benchmark.reporting.light import light_section
 from benchmark.reporting.literature import published
 from benchmark.reporting.overview import overview
@@ -36,8 +36,8 @@ CURVES = (
 LITERATURE = " Open markers are mean returns from the literature, on other versions of the environment (table below)."
 MINUTES = (
     "The same on {} by minutes of processor time, of all threads, evaluations and repeated steps after an interruption "
-    "included. A run's evaluation is placed at the run's time times the evaluation's step divided by the run's steps, late by "
-    "up to the share of random steps, and a method's curve at the median over its runs."
+    "included. A run's time is shared evenly among its steps, but for the random ones at the start, which are taken to need "
+    "none, and a method's curve is placed at the median over its runs."
 )
 SENSITIVITY = "learning curves, every seed (thin) and the interquartile mean over seeds (bold), on one vertical scale."
 STABILITY = (
@@ -200,8 +200,9 @@ def minutes_caption(study: Study, task: str) -> str:
     :param task: the task
     :return: the caption, with the number of runs that are left out, and a warning if the runs were on several machines
     """
-    shown = shown_methods(study, task)
-    records = [record for record in study.records if record.task == task and record.method in shown]
+    timed = timed_methods(study, task)
+    offline = [method for method in shown_methods(study, task) if method not in timed]
+    records = [record for record in study.records if record.task == task and record.method in timed]
     times = times_of(study, task)
     untimed = sum(record.processor_seconds is None for record in records)
     elsewhere = sum(record.processor_seconds is not None and record.method in times.elsewhere for record in records)
@@ -209,6 +210,9 @@ def minutes_caption(study: Study, task: str) -> str:
     sentences = [MINUTES.format(task)]
     if any(record.task == task and record.population > 1 for record in study.records):
         sentences.append("The time of runs that were trained as one population is the process's, divided by their number.")
+        sentences.append("On a GPU, their environments have processes of their own, whose time is not counted.")
+    if offline:
+        sentences.append(f"Left out, as they train their policies after the last step: {', '.join(offline)}.")
     if untimed:
         sentences.append(f"Left out: {untimed} run{'s' * (untimed > 1)} without a recorded time.")
     if incomplete:

@@ -8,7 +8,7 @@ import numpy as np
 from benchmark.common.records import Record
 from benchmark.common.style import styles
 from benchmark.reporting.estimates import REPETITIONS, bootstrap, interquartile_mean
-from benchmark.reporting.learning_curves import MOST, first_training_step, learnt_range, shown_methods, times_of
+from benchmark.reporting.learning_curves import MOST, Times, first_training_step, learnt_range, shown_methods, times_of
 from benchmark.reporting.literature import published
 from benchmark.reporting.scores import Study, curves, evaluation_grid, floors
 from benchmark.reporting.verdicts import SHOWN_FIRST
@@ -32,7 +32,6 @@ def figure(study: Study, task: str, repetitions: int = REPETITIONS) -> dict[str,
     :return: ``data`` and ``layout`` of plotly.js
     """
     times = times_of(study, task)
-    keys = {record.key for record in times.runs}
     data: list[Trace] = []
     methods = shown_methods(study, task)
     # The others wait in the legend, so that the figure can be read
@@ -40,7 +39,7 @@ def figure(study: Study, task: str, repetitions: int = REPETITIONS) -> dict[str,
     for method in methods:
         runs = [record for record in study.records if (record.task, record.method) == (task, method)]
         visible = True if len(methods) <= MOST or method in first else "legendonly"
-        traces = _method(study, runs, times.minutes_per_step.get(method), keys, repetitions)
+        traces = _method(study, runs, times, repetitions)
         data += [trace | {"visible": visible} for trace in traces]
     data += [_literature(entry) for entry in published(task, study.facts["steps"])]
     buttons = [_button(data, "by steps", "x", STEPS)]
@@ -67,18 +66,17 @@ def figure(study: Study, task: str, repetitions: int = REPETITIONS) -> dict[str,
     return {"data": data, "layout": layout}
 
 
-def _method(
-    study: Study, runs: Sequence[Record], minutes_per_step: float | None, timed: set[str], repetitions: int
-) -> list[Trace]:
+def _method(study: Study, runs: Sequence[Record], times: Times, repetitions: int) -> list[Trace]:
     """Return the traces of a method; those of runs without a time have no points by minutes."""
     method, task = runs[0].method, runs[0].task
+    timed = {record.key for record in times.runs}
     (look,) = styles([method]).values()
     floor, grid = floors(study.records)[task], evaluation_grid(study.records, task)
     lines = curves(runs, floor, grid)
     name = study.label(method, len(runs))
 
     def trace(kind: str, y: np.ndarray, is_timed: bool, **options: Any) -> Trace:
-        minutes = grid * minutes_per_step if minutes_per_step is not None and is_timed else np.array([])
+        minutes = times.minutes(method, grid) if method in times.minutes_per_step and is_timed else np.array([])
         points = {"x": _rounded(grid), "y": _rounded(y), "minutes": _rounded(minutes)}
         return (
             {"type": "scatter", "mode": "lines", "name": name, "legendgroup": method, "meta": {"kind": kind}}

@@ -1,6 +1,6 @@
 """Learning curves: by environment steps, beside published returns, and by minutes of processor time."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,7 +36,7 @@ def curves_by_steps(study: Study, task: str, repetitions: int = REPETITIONS) -> 
     :return: the picture, as PNG
     """
     records = [record for record in study.records if record.task == task]
-    figure, drawn = _figure(study, task, records, dict.fromkeys(study.methods, 1.0), repetitions)
+    figure, drawn = _figure(study, task, records, lambda method, grid: grid, repetitions)
     count_steps(list(drawn.values()))
     for entry in published(task, study.facts["steps"]):
         place = entry.method if entry.method in drawn else ""
@@ -59,7 +59,7 @@ def curves_by_minutes(study: Study, task: str, repetitions: int = REPETITIONS) -
     :return: the picture, as PNG
     """
     times = times_of(study, task)
-    figure, drawn = _figure(study, task, times.runs, times.minutes_per_step, repetitions)
+    figure, drawn = _figure(study, task, times.runs, times.minutes, repetitions)
     label_below(list(drawn.values()), "minutes of processor time")
     legend(figure, list(drawn.values()), task)
     return png(figure)
@@ -71,7 +71,8 @@ class Times:
     The times of a task's runs.
 
     :param runs: the runs that curves by minutes show
-    :param minutes_per_step: by method
+    :param minutes_per_step: of a step after the random ones at the start, by method
+    :param random_steps: the number of random steps at the start, by method
     :param processors: the processors on which these minutes were measured
     :param all_processors: those of all runs
     :param elsewhere: the methods that are left out, as they were trained on other processors only
@@ -79,36 +80,49 @@ class Times:
 
     runs: list[Record]
     minutes_per_step: dict[str, float]
+    random_steps: dict[str, int]
     processors: list[str]
     all_processors: list[str]
     elsewhere: list[str]
+
+    def minutes(self, method: str, grid: np.ndarray) -> np.ndarray:
+        """
+        Return when a method reaches steps.
+
+        :param method: the method
+        :param grid: environment steps (E)
+        :return: minutes (E)
+        """
+        return np.maximum(grid - self.random_steps[method], 0) * self.minutes_per_step[method]
 
 
 def times_of(study: Study, task: str) -> Times:
     """
     Return a task's runs that curves by minutes show, and how long each method trains.
 
-    The time of a run is shared evenly among its steps, so that an evaluation takes place at ``processor_seconds`` times
-    its step, divided by the run's steps. An evaluation of a method stands at the median of its runs' times, of those on the
-    processor that trained the most methods, and the most runs of them; of all runs, if no processor trained two methods. A
-    failed run has the time of the method's other runs, as the step at which it failed is not recorded.
+    The time of a run is shared evenly among its steps after the random ones at the start, which need little. An evaluation of
+    a method stands at the median of its runs' times, of those on the processor that trained the most methods, and the most
+    runs of them; of all runs, if no processor trained two methods. A failed run has the time of the method's other runs, as
+    the step at which it failed is not recorded.
 
     :param study: the study
     :param task: the task
-    :return: the times of :func:`shown_methods`, without those of which no complete run on that processor has a time
+    :return: the times of :func:`timed_methods`, without those of which no complete run on that processor has a time
     """
-    shown = shown_methods(study, task)
+    shown = timed_methods(study, task)
     records = [record for record in study.records if record.task == task and record.method in shown]
     measured = [record for record in records if record.processor_seconds is not None]
     complete = [record for record in measured if not failed(record)]
     compared = _on_one_processor(study, complete)
     seconds: dict[str, list[float]] = {}
+    random_steps = {method: int(_entry(study, method, task).get("learning_starts", 0)) for method in shown}
     for record in compared:
-        seconds.setdefault(record.method, []).append((record.processor_seconds or 0.0) / record.steps)
+        trained = max(record.steps - random_steps[record.method], 1)
+        seconds.setdefault(record.method, []).append((record.processor_seconds or 0.0) / trained)
     paces = {method: float(np.median(each)) / 60 for method, each in seconds.items()}
     kept = [record for record in measured if record.method in paces]
     elsewhere = [method for method in dict.fromkeys(record.method for record in complete) if method not in paces]
-    return Times(kept, paces, _all_processors(study, compared), _all_processors(study, measured), elsewhere)
+    return Times(kept, paces, random_steps, _all_processors(study, compared), _all_processors(study, measured), elsewhere)
 
 
 def _on_one_processor(study: Study, runs: Sequence[Record]) -> Sequence[Record]:
@@ -147,10 +161,28 @@ def shown_methods(study: Study, task: str) -> list[str]:
     return learners or [method for method in study.methods if method in ran]
 
 
+def timed_methods(study: Study, task: str) -> list[str]:
+    """
+    List the methods whose learning curves can be drawn by minutes.
+
+    :param study: the study
+    :param task: the task
+    :return: those of :func:`shown_methods`, without those that spend most of their time after their last step
+    """
+    shown = shown_methods(study, task)
+    return [method for method in shown if _entry(study, method, task).get("policy_training") != "offline"]
+
+
+def _entry(study: Study, method: str, task: str) -> dict[str, Any]:
+    """Return the hyperparameters of a method, as far as the study's description has them."""
+    configurations = study.facts.get("configurations", {})
+    return configurations.get(method) or configurations.get(f"{method},{task}", {})
+
+
 def _figure(
-    study: Study, task: str, records: Sequence[Record], units_per_step: Mapping[str, float], repetitions: int
+    study: Study, task: str, records: Sequence[Record], place: Callable[[str, np.ndarray], np.ndarray], repetitions: int
 ) -> tuple[Figure, dict[str, Axes]]:
-    """Draw each method's runs against its steps in some unit. The panels are by method, or the only one is that of all, ""."""
+    """Draw each method's runs at the places of its steps. The panels are by method, or the only one is that of all, ""."""
     by_method = {method: [record for record in records if record.method == method] for method in shown_methods(study, task)}
     by_method = {method: runs for method, runs in by_method.items() if runs}
     floor, grid = floors(study.records)[task], evaluation_grid(records, task)
@@ -161,14 +193,14 @@ def _figure(
     drawn = {"": axes[0]} if is_alone else dict(zip(by_method, axes, strict=True))
     reference = REFERENCE if REFERENCE in by_method else next(iter(by_method))
     for method, runs in by_method.items():
-        panel, x = drawn["" if is_alone else method], grid * units_per_step[method]
+        panel, x = drawn["" if is_alone else method], place(method, grid)
         if len(grid) == 0:
             continue
         if not is_alone:
             panel.set_title(study.label(method, len(runs)).replace(" (", "\n("))
             if method != reference:
                 beside = interquartile_mean(lines[reference][None])[0]
-                panel.plot(grid * units_per_step[reference], beside, label=f"{reference}, in all panels", **BESIDE)
+                panel.plot(place(reference, grid), beside, label=f"{reference}, in all panels", **BESIDE)
         draw_seeds(panel, x, lines[method], looks[method]["color"])
         middle, interval = bootstrap(interquartile_mean, [[lines[method]]], repetitions)
         label, look = (
