@@ -201,6 +201,29 @@ def test_a_population_that_ends_its_processes_every_time_is_dissolved(ledger, tm
     assert ledger.records() == []
 
 
+@pytest.mark.usefixtures("clock")
+@pytest.mark.parametrize("size", [1, 8])
+@pytest.mark.parametrize("is_same", [True, False])
+def test_the_time_of_a_run_that_another_storage_began_is_not_known(tmp_path, size, is_same):
+    """Its state is here, but its first trials and their times are in the other storage."""
+    first, second = (Ledger(InMemoryStorage(), "study", GRACE, Clock()) for _ in range(2))
+    for each in (first, second):
+        each.open(make_sweep(["Good"], seeds=2), {"experiment": "tiny"})
+    claims, group, _ = claim(first, tmp_path, size)
+    for each in claims:
+        first.beat(each, "1-0", 50, 7.0, 7.0)
+    if group is not None:
+        group.write()
+        StateStore(group.states).save(1, {})
+    give_back(first, claims, tmp_path, with_state=(0,) if group is None else ())
+    ledger = first if is_same else second
+    worker.execute_runs(ledger, tmp_path, "a process", population=size)
+    times = {record.seed: record.seconds for record in ledger.records()}
+    assert times[0] == (8.0 if is_same else None)
+    # Of a population, all runs have the state
+    assert times[1] == (1.0 if size == 1 else times[0])
+
+
 def test_the_size_of_a_population(monkeypatch):
     assert (parse(["e6"]).population, parse(["e6", "--population"]).population) == ("auto", "auto")
     assert (population_size("auto", "cpu"), population_size(5, "cpu")) == (1, 5)

@@ -67,6 +67,16 @@ class ClaimedRuns:
             for claim in self._open.values():
                 self._ledger.annotate(claim, name, value)
 
+    def note_continuation(self) -> None:
+        """
+        Note that all open runs go on from a state, unless earlier trials of this study have left it.
+
+        :raises TrialLostError: if another process has ended a trial
+        """
+        with self._lock:
+            for claim in self._open.values():
+                self._ledger.note_continuation(claim)
+
     def report(self, run: Run, step: int, value: float) -> None:
         """
         Record an evaluation, of a run that is open.

@@ -26,6 +26,8 @@ STOPPED, LOST = "given back: its process was stopped", "lost: its process fell s
 PROCESSORS = "processors"
 # Of a run that is trained in a population: the number of its agents, and the name of the group of runs
 POPULATION = "population"
+# Of a trial that goes on from a state that another storage's trial has left: the time until then is not known
+CONTINUED = "continued"
 # The seed is an attribute, for optuna-dashboard to show and sort by. As a parameter, it would take part in the importances of
 # parameters. Studies that earlier versions began have it as a parameter, too.
 SEED = "seed"
@@ -84,8 +86,12 @@ def seconds_of(trials: Iterable[FrozenTrial], kind: str) -> float | None:
 
     :param trials: all trials of the run
     :param kind: "seconds" by the clock, or "processor_seconds"
-    :return: the sum of what their last heartbeats reported; None if one of them has reported progress, but not this time
+    :return: the sum of what their last heartbeats reported; None if one of them has reported progress, but not this time, or
+        went on from a state of another storage
     """
+    trials = list(trials)
+    if any(CONTINUED in trial.user_attrs for trial in trials):
+        return None
     times = [trial.user_attrs[PROGRESS].get(kind) for trial in trials if PROGRESS in trial.user_attrs]
     return None if None in times else sum(times)
 

@@ -6,9 +6,9 @@ from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
 
 from benchmark.sweeps.attempts import fruitless, in_words
-from benchmark.sweeps.heartbeats import TrialLostError, noticing_loss, send_beat
+from benchmark.sweeps.heartbeats import PROGRESS, TrialLostError, noticing_loss, send_beat
 from benchmark.sweeps.storages import patiently
-from benchmark.sweeps.study_trials import ERROR, KEY, OUTCOME, Claim
+from benchmark.sweeps.study_trials import CONTINUED, ERROR, KEY, OUTCOME, Claim
 from benchmark.sweeps.study_view import StudyView
 
 
@@ -93,6 +93,17 @@ class TrialWriter(StudyView):
         :return: the number
         """
         return fruitless(trial for trial in self.trials() if trial.user_attrs[KEY] == claim.run.key)
+
+    def note_continuation(self, claim: Claim) -> None:
+        """
+        Note that a run goes on from a state, unless an earlier trial of this study has left it.
+
+        :param claim: the run
+        :raises TrialLostError: if another process has ended the trial
+        """
+        earlier = (trial for trial in self.trials() if trial.state.is_finished() and trial.user_attrs[KEY] == claim.run.key)
+        if not any(PROGRESS in trial.user_attrs for trial in earlier):
+            self.annotate(claim, CONTINUED, True)
 
     def fail(self, claim: Claim, error: BaseException) -> None:
         """

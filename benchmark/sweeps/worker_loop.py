@@ -23,6 +23,7 @@ from benchmark.sweeps.runs import Run
 from benchmark.sweeps.signals import TERMINATED, end_if_asked, undisturbed
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import PROCESSORS, RUN, Claim, owned
+from sb3_cgp.resumption.store import StateStore
 
 
 def execute_runs(
@@ -80,6 +81,8 @@ def _train_claimed(
             claimed.annotate(PROCESSORS, [processor(machine(get_device(device)))])
             with HeartbeatThread(claimed.beat, beat, parent) as heartbeat:
                 locks.enter_context(locked(folders))
+                if has_state(runs[0], folders[0]) if group is None else StateStore(group.states).steps():
+                    claimed.note_continuation()
                 if group is None:
                     finals = {0: train(runs[0], folders[0], report, heartbeat.watch, device)}
                 else:
