@@ -249,7 +249,7 @@ def _margin_in_words(table: pd.DataFrame, pair: tuple[str, str]) -> str:
     """Return the margin of a verdict in returns, on each task that is compared."""
     ranges = in_common(table, pair).groupby("task", sort=False)["range"].first()
     margins = [f"{MARGIN * width:,.{0 if MARGIN * width >= 100 else 2}f} on {task}" for task, width in ranges.items()]
-    return f"{MARGIN:g} of the range is {', '.join(margins)}"
+    return f"{MARGIN:g} of the range is {'; '.join(margins)}"
 
 
 def _signed(found: Estimate, more: str, less: str, form: str = ".3f") -> str:
