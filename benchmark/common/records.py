@@ -65,7 +65,7 @@ class Record:
     :param returns: mean return of each evaluation's episodes
     :param final: mean return of the final model over ``FINAL_EPISODES`` episodes; None for a run that failed
     :param error: the error of a failed run; None for other runs
-    :param seconds: wall-clock time of all attempts together
+    :param seconds: wall-clock time of all attempts together; None where it is not known
     :param processor_seconds: time on the processor of all attempts and threads together; None where it was not measured.
         Of a run in a population, the process's time divided by the number of agents
     :param population: number of agents that were trained in one process with it, itself included; 1 for a run alone
