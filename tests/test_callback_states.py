@@ -300,8 +300,8 @@ def test_what_a_callback_has_changed_and_cannot_be_saved_is_named_once(tmp_path)
     reasons = {message.split("`")[1]: message for message in messages}
     assert list(reasons) == ["own", "patience", "results", "tensor"]
     assert len(messages) == 4
-    assert "as it is a defaultdict, no plain data. A resumed" in reasons["own"]
-    assert "as it is a Tensor, no plain data. A resumed" in reasons["tensor"]
+    assert "as it is a defaultdict, not plain data. A resumed" in reasons["own"]
+    assert "as it is a Tensor, not plain data. A resumed" in reasons["tensor"]
     assert "as it is an argument of its constructor. A resumed" in reasons["patience"]
     assert "define get_training_state() and set_training_state()." in reasons["results"]
     again = Losing([])
@@ -310,6 +310,21 @@ def test_what_a_callback_has_changed_and_cannot_be_saved_is_named_once(tmp_path)
     assert type(again.lengths) is defaultdict
     # As the warning says
     assert (again.own, again.results) == ({"steps": 10}, [*range(21, 31)])
+
+
+def test_a_callback_that_is_given_after_the_trainings_start_is_said_to_have_lost_nothing(tmp_path):
+    class Adding(Watch):
+        def _on_step(self):
+            if self.n_calls == 15:
+                self.late = Watch()
+                self.late.init_callback(self.model)
+            return True
+
+    adding = Adding()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*is not saved")
+        CGP("MlpPolicy", "Pendulum-v1", **TINY).learn(20, [adding, TrainingCheckpointCallback(10, tmp_path)])
+    assert adding.late.model is adding.model
 
 
 class Stepping(BaseCallback):

@@ -139,11 +139,12 @@ def _callback_state(callback: BaseCallback, training_env: VecEnv, start: Start, 
     # One that has counted in an earlier training has further values from there
     unsaved = _unsaved(callback) | (set() if start.was_called else unchanged)
     state["attributes"] = plain_attributes(callback, without=unsaved)
-    changed = {name for name, value in now.items() if value is not None} - unchanged
+    # What one that the training was given after its start has changed is not known
+    changed = {name for name, value in now.items() if value is not None} - unchanged if start.attributes else set()
     for name in sorted(changed - state["attributes"].keys() - state["environments"].keys()):
         value = vars(callback)[name]
         if not isinstance(value, LEFT_OUT):
-            reason = "an argument of its constructor" if name in unsaved else f"a {type(value).__qualname__}, no plain data"
+            reason = "an argument of its constructor" if name in unsaved else f"a {type(value).__qualname__}, not plain data"
             problems.append(
                 f"{type(callback).__name__}'s `{name}`, which has changed in the training, is not saved, as it is {reason}. A "
                 f"resumed training begins with it as the callback is given. To save it, define {METHODS}."
