@@ -130,7 +130,14 @@ def test_a_run_that_gets_further_each_time_is_no_failure(tmp_path):
 @pytest.mark.usefixtures("clock")
 @pytest.mark.parametrize(
     "error",
-    [OSError(errno.ENOSPC, "No space left"), PermissionError("logs"), ImportError("no Box2D"), ConnectionError("database")],
+    [
+        OSError(errno.ENOSPC, "No space left"),
+        OSError(errno.ESTALE, "Stale file handle"),
+        OSError(errno.EMFILE, "Too many open files"),
+        PermissionError("logs"),
+        ImportError("no Box2D"),
+        ConnectionError("database"),
+    ],
 )
 def test_an_error_of_every_run_is_never_a_failure(tmp_path, error):
     ledger = Ledger(InMemoryStorage(), "study", GRACE)

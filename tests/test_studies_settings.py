@@ -65,6 +65,13 @@ def test_further_methods_have_what_all_methods_have_in_common(before, now, messa
     assert len(ledger.trials()) == 2 * n_trials
 
 
+def test_a_hyperparameter_that_an_axis_replaces_everywhere_may_be_left_out():
+    storage = InMemoryStorage()
+    ledger = open_ledger(storage, Clock(), axes=AXIS, hyperparams={"noise_std": 0.5})
+    open_ledger(storage, Clock(), axes=AXIS, methods=["Other"])
+    assert {trial.user_attrs["run"]["hyperparams"]["noise_std"] for trial in ledger.trials()} == {0.1}
+
+
 def test_a_study_of_an_earlier_version_gets_further_methods():
     storage = InMemoryStorage()
     ledger = Ledger(storage, "study")

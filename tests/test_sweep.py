@@ -1,6 +1,7 @@
 """The command that runs sweeps: its arguments, and what it exports and adopts."""
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -347,6 +348,35 @@ def test_runs_of_other_settings_are_not_adopted(tmp_path, ledger):
     with pytest.raises(SweepError, match=r"hyperparams\.gamma: was 'not given' and is now 0\.5, .* cannot be adopted"):
         ended_runs(folder, describe(other, [], "cpu"))
     assert ended_runs(tmp_path / "nothing", {}) == ([], [])
+
+
+def test_runs_are_adopted_by_task_where_the_tasks_entries_differ(tmp_path):
+    """The names of configurations have the task where its entry is not the others'."""
+    (tmp_path / "runs.jsonl").touch()
+    entries = {"TD3": {"algo": "td3", "gamma": 0.98}}
+    was = {
+        "steps": 10,
+        "evaluation_interval": 5,
+        "evaluation_episodes": 1,
+        "tasks": ["Pendulum-v1"],
+        "configurations": entries,
+    }
+    facts = {
+        "title": "",
+        "experiment": "e",
+        "axes": {},
+        "settings_in_words": "",
+        "methods": ["TD3"],
+        "seeds": [0],
+        "runs_planned": 1,
+        "commands": [],
+    }
+    (tmp_path / "study.json").write_text(json.dumps(facts | was))
+    for gamma, is_refused in ((0.98, False), (0.5, True)):
+        now = {"TD3,Pendulum-v1": {"algo": "td3", "gamma": gamma}, "TD3,Reacher-v5": {"algo": "td3", "gamma": 0.9}}
+        description = was | {"tasks": ["Pendulum-v1", "Reacher-v5"], "configurations": now, "shared": {}}
+        with pytest.raises(SweepError, match="configurations") if is_refused else nullcontext():
+            ended_runs(tmp_path, description)
 
 
 def test_where_databases_are_is_not_recorded():

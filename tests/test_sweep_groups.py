@@ -184,6 +184,13 @@ def test_a_state_on_another_machine_gives_no_preference(ledger, tmp_path):
     assert claim(ledger, tmp_path / "here", 1)[2] == [0]
 
 
+def test_runs_that_another_machine_may_continue_come_after_those_that_nobody_has_begun(ledger, tmp_path):
+    (taken,), *_ = claim(ledger, tmp_path / "there", 1)
+    ledger.beat(taken, "1", 50, 1.0)
+    give_back(ledger, [taken], tmp_path / "there", with_state=(0,))
+    assert [claim(ledger, tmp_path / "here", 1)[2] for _ in range(4)] == [[1], [2], [3], [0]]
+
+
 def test_a_population_that_ends_its_processes_every_time_is_dissolved(ledger, tmp_path, monkeypatch):
     def train_group(group, folders, claimed, watch, device):
         group.write()

@@ -123,6 +123,21 @@ def read_records(folder: Path) -> list[Record]:
     return records
 
 
+def entries_by_task(description: dict[str, Any]) -> dict[tuple[str, str], dict[str, Any]]:
+    """
+    Return the hyperparameters of a study's configurations on each of its tasks.
+
+    :param description: the study's description, whose "configurations" name a task only where the tasks' entries differ
+    :return: hyperparameters by the configuration in words and the task
+    """
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    tasks = description.get("tasks", [])
+    for name, entry in description.get("configurations", {}).items():
+        own = [task for task in tasks if name.endswith(f",{task}")]
+        found |= {(name.removesuffix(f",{task}"), task): entry for task in own or tasks}
+    return found
+
+
 def read_description(folder: Path, *further: str) -> dict[str, Any]:
     """
     Read the description of a study.

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmark.common.canvas import BAND, count_steps, draw_line, draw_seeds, label_below, legend, panels, png, styled
 from benchmark.common.provenance import processors_of_commands
-from benchmark.common.records import Record
+from benchmark.common.records import Record, entries_by_task
 from benchmark.common.style import styles
 from benchmark.reporting.comparisons import RANDOM
 from benchmark.reporting.estimates import REPETITIONS, bootstrap, interquartile_mean
@@ -175,8 +175,7 @@ def timed_methods(study: Study, task: str) -> list[str]:
 
 def _entry(study: Study, method: str, task: str) -> dict[str, Any]:
     """Return the hyperparameters of a method, as far as the study's description has them."""
-    configurations = study.facts.get("configurations", {})
-    return configurations.get(method) or configurations.get(f"{method},{task}", {})
+    return entries_by_task(study.facts).get((method, task), {})
 
 
 def _figure(

@@ -3,9 +3,8 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
-from benchmark.common.records import Record
+from benchmark.common.records import Record, entries_by_task
 from benchmark.reporting.estimates import FEWEST_RUNS
 from benchmark.reporting.scores import Study
 
@@ -31,7 +30,7 @@ def without_side_runs(studies: Sequence[Study]) -> list[Study]:
             of_steps.setdefault(record.steps, Counter())[record.method] += 1
             of_study = by_study.setdefault((record.experiment, record.task, record.steps), {})
             of_study.setdefault(study.name, set()).add(record.method)
-    configurations = {study.name: study.facts.get("configurations", {}) for study in studies}
+    configurations = {study.name: entries_by_task(study.facts) for study in studies}
 
     def is_trial(record: Record) -> bool:
         numbers = by_steps[record.experiment, record.task]
@@ -41,7 +40,10 @@ def without_side_runs(studies: Sequence[Study]) -> list[Study]:
     def is_variation(record: Record, name: str) -> bool:
         methods = by_study[record.experiment, record.task, record.steps]
         mains = [other for other, more in methods.items() if methods[name] < more]
-        return any(_differ(configurations[name], configurations[main]) for main in mains)
+        own = configurations[name]
+        return any(
+            own[each] != configurations[main][each] for main in mains for each in own.keys() & configurations[main].keys()
+        )
 
     kept = []
     for study in studies:
@@ -52,8 +54,3 @@ def without_side_runs(studies: Sequence[Study]) -> list[Study]:
             tasks = [task for task in study.facts["tasks"] if task not in left_out]
             kept.append(replace(study, records=records, facts=study.facts | {"tasks": tasks}))
     return kept
-
-
-def _differ(some: dict[str, Any], others: dict[str, Any]) -> bool:
-    """Return whether two studies have a configuration of the same name with different hyperparameters."""
-    return any(some[name] != others[name] for name in some.keys() & others.keys())

@@ -3,6 +3,7 @@
 import errno
 from collections.abc import Iterable
 
+import torch as th
 from gymnasium.error import DependencyNotInstalled
 from optuna.trial import FrozenTrial, TrialState
 
@@ -17,8 +18,16 @@ SUSPECT, DISSOLVED = "given back after an error: ", "dissolved: "
 # Attempts one after another without progress after which a run is given up
 MOST = 3
 # Errors that every run of the machine would have
-OF_ALL_RUNS = (*STORAGE_ERRORS, ImportError, DependencyNotInstalled, PermissionError, FileExistsError)
-DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+OF_ALL_RUNS = (
+    *(*STORAGE_ERRORS, ImportError, DependencyNotInstalled, PermissionError, FileExistsError),
+    # Of a GPU; PyTorch has it since 2.8
+    *([th.AcceleratorError] if hasattr(th, "AcceleratorError") else []),
+)
+# Of a disk that is full, read-only, broken or gone, and of too many open files
+SYSTEM_ERRORS = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ESTALE, errno.ENODEV, errno.ENXIO),
+    *(errno.EMFILE, errno.ENFILE),
+)
 
 
 def in_words(error: BaseException) -> str:
@@ -38,7 +47,7 @@ def outcome_of(error: Exception) -> str:
     :param error: the error
     :return: the outcome, which counts against the run unless every run would have the error
     """
-    is_of_all = isinstance(error, OF_ALL_RUNS) or getattr(error, "errno", None) in DISK_ERRORS
+    is_of_all = isinstance(error, OF_ALL_RUNS) or getattr(error, "errno", None) in SYSTEM_ERRORS
     return STOPPED if is_of_all else SUSPECT + in_words(error)
 
 

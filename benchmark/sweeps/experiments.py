@@ -58,9 +58,18 @@ class Sweep:
 
     @property
     def shared(self) -> dict[str, dict[str, Any]]:
-        """What all methods have in common, as JSON has it: the hyperparameters of all, and what the axes set."""
-        axes = {name: axis.model_dump() for name, axis in self.file.axes.items()}
-        return json.loads(json.dumps({"hyperparams": self.file.hyperparams, "axes": axes}))
+        """What all methods have in common, as JSON has it: the hyperparameters that have an effect, and what the axes set."""
+        file = self.file
+        axes = {name: axis.model_dump() for name, axis in file.axes.items()}
+        hyperparams = {key: value for key, value in file.hyperparams.items() if not self._is_replaced(key)}
+        return json.loads(json.dumps({"hyperparams": hyperparams, "axes": axes}))
+
+    def _is_replaced(self, key: str) -> bool:
+        """Return whether an axis sets a hyperparameter of every method of the file, also of those that were not chosen."""
+        return any(
+            all(key in axis.hyperparams(name, value, method) for value in axis.values for method in self.file.methods)
+            for name, axis in self.file.axes.items()
+        )
 
     def runs(self) -> list[Run]:
         """

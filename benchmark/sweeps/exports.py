@@ -9,7 +9,16 @@ from optuna.trial import TrialState
 
 from benchmark.common.files import write_json
 from benchmark.common.provenance import processors_of_commands
-from benchmark.common.records import REWRITE, RUNS, STUDY, Record, read_description, read_records, write_records
+from benchmark.common.records import (
+    REWRITE,
+    RUNS,
+    STUDY,
+    Record,
+    entries_by_task,
+    read_description,
+    read_records,
+    write_records,
+)
 from benchmark.sweeps.experiments import difference
 from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.study_trials import SHARED, owned
@@ -89,12 +98,11 @@ def ended_runs(folder: Path, description: dict[str, Any]) -> tuple[list[Record],
         raise SweepError(folder / STUDY, "", f"is missing, so that the runs beside it cannot be adopted; {REWRITE}")
     was = read_description(folder, "configurations")
     for key in ("steps", "evaluation_interval", "evaluation_episodes", "configurations"):
-        now = description[key]
         if key == "configurations":
-            both = was[key].keys() & now.keys()
-            same = all(was[key][name] == now[name] for name in both)
+            before, now = entries_by_task(was), entries_by_task(description)
+            same = all(before[each] == now[each] for each in before.keys() & now.keys())
         else:
-            same = was[key] == now
+            same = was[key] == description[key]
         if not same:
             raise SweepError(folder / STUDY, key, "differs from the sweep's, so that its runs cannot be adopted")
     if found := difference(was.get(SHARED), description[SHARED]):
