@@ -1,6 +1,7 @@
 """Selectors besides the paper's CEM in a training of CGP."""
 
 import math
+import threading
 from copy import deepcopy
 
 import numpy as np
@@ -280,6 +281,37 @@ def test_whatever_selector_is_set_is_saved_and_the_model_remains_as_it_is(argume
     loaded = CGP.load(tmp_path / "model", env=model.get_env())
     assert type(loaded.policy.selector) is type(selector)
     assert loaded.learn(60).policy.selector == selector
+
+
+class WithOwnSelector(MlpPolicy):
+    """A policy whose selector refers to it, and holds what cannot be saved."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.selector = Fixed(0.5)
+        self.selector.policy, self.selector.lock = [self], threading.Lock()
+
+
+def test_a_selector_that_the_policy_makes_is_made_again(tmp_path):
+    model = make_model(policy=WithOwnSelector)
+    model.save(tmp_path / "model")
+    loaded = CGP.load(tmp_path / "model")
+    assert loaded.policy.selector.policy[0] is loaded.policy
+    # One in its place is saved, and the policy's own again when it is back
+    own, model.policy.selector = model.policy.selector, CEM()
+    model.save(tmp_path / "model")
+    assert CGP.load(tmp_path / "model").policy.selector == CEM()
+    model.policy.selector = own
+    model.save(tmp_path / "model")
+    assert CGP.load(tmp_path / "model").policy.selector.action == 0.5
+
+
+def test_arguments_that_a_saved_selector_replaces_are_named_when_a_model_is_loaded(tmp_path):
+    model = make_model()
+    model.policy.selector = MPPI()
+    model.save(tmp_path / "model")
+    with pytest.warns(UserWarning, match=r"cem_start='actor', cem_actor_std=0\.1 has no effect, as the selector MPPI"):
+        CGP.load(tmp_path / "model", cem_start="actor", cem_actor_std=0.1)
 
 
 @pytest.mark.parametrize("arguments", [{}, LIGHT])

@@ -55,6 +55,7 @@ class SelectorAlgorithm(CGP):
         given = self.policy_kwargs.get("actor_proposes")
         require(given is None, "policy_kwargs['actor_proposes']", given, "left out: CGP sets it when the actor is trained")
         super()._setup_model()
+        self._initial_selector = self.policy.selector
         if "_saved_selector" in vars(self):
             saved = self._saved_selector
             self.policy.selector = self._make_selector() if saved is None else saved
@@ -62,7 +63,10 @@ class SelectorAlgorithm(CGP):
             allowed = "'prior' with a selector of `policy_kwargs` or of the policy's class, which replaces CEM"
             require(self._selector_is_made_here, "cem_start", self.cem_start, allowed)
         self._check_selector()
-        self._warn_if_replaced(*(name for name, default in _defaults().items() if getattr(self, name) != default))
+        defaults = {name: getattr(type(self), name, None) for name in CEM_ARGUMENTS} | {
+            f"cem_{name}": value for name, value in vars(CEM()).items()
+        }
+        self._warn_if_replaced(*(name for name, default in defaults.items() if getattr(self, name) != default))
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         # One may have been set on the policy
@@ -82,8 +86,16 @@ class SelectorAlgorithm(CGP):
         :param args: the arguments of SB3's method
         :param kwargs: the same arguments by keyword
         """
-        self._saved_selector = None if self._selector_is_made_here else self.policy.selector
+        selector = self.policy.selector
+        if selector is self._initial_selector and type(selector) not in (CEM, ActorCEM):
+            # The constructor makes it again, and it may refer to the policy
+            vars(self).pop("_saved_selector", None)
+        else:
+            self._saved_selector = None if self._selector_is_made_here else selector
         super().save(*args, **kwargs)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_initial_selector"]
 
     def __setattr__(self, name: str, value: Any) -> None:
         """
@@ -172,8 +184,3 @@ class SelectorAlgorithm(CGP):
     def _choose_inference(self) -> None:
         super()._choose_inference()
         self.policy.actor_proposes = self._has_actor  # type: ignore[assignment]
-
-
-def _defaults() -> dict[str, Any]:
-    """Return the default values of CEM's arguments, by their names as CGP's."""
-    return {f"cem_{name}": value for name, value in vars(CEM()).items()}
