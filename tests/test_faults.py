@@ -17,7 +17,7 @@ from environments import Doubles
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecNormalize
 from trainings import Do
 
 from sb3_cgp import CGP
@@ -264,6 +264,27 @@ def test_observations_are_checked_before_they_are_normalised(observation, at):
     if at == 15:
         # The statistics, which VecNormalize updates first, have not seen it
         assert model.learn(5, reset_num_timesteps=False).num_timesteps >= 19
+
+
+class Repaired(VecEnvWrapper):
+    """Replaces what is infinite, also in an episode's last observation."""
+
+    def reset(self):
+        return np.nan_to_num(self.venv.reset())
+
+    def step_wait(self):
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for info in infos:
+            if "terminal_observation" in info:
+                info["terminal_observation"] = np.nan_to_num(info["terminal_observation"], posinf=1.0)
+        return np.nan_to_num(observations, posinf=1.0), rewards, dones, infos
+
+
+@pytest.mark.parametrize("outer", [lambda env: env, VecNormalize], ids=["alone", "normalised"])
+@pytest.mark.parametrize("at", [14, 15], ids=["within", "last"])
+def test_observations_that_a_wrapper_repairs_are_trained_on(at, outer):
+    env = outer(Repaired(DummyVecEnv([lambda: Failing(with_observation(np.full(3, np.inf)), at)])))
+    assert CGP("MlpPolicy", env, **SMALL).learn(20).num_timesteps == 20
 
 
 @pytest.mark.parametrize("normalised", [False, True])
