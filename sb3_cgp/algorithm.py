@@ -283,8 +283,8 @@ class CGP(
 
         Callbacks see each gradient step as a step in which no environment moves: ``num_timesteps`` does not change, no
         episode ends, rewards are 0. Values are logged at ``num_timesteps`` plus the number of gradient steps. A callback
-        that stops the training before its plateau causes a warning, and the next ``learn`` goes on with it. One that stops
-        it within its first round leaves CEM to act.
+        that stops the training before its plateau causes a warning, and the next ``learn`` goes on with it if
+        ``policy_training`` is "offline". One that stops it within its first round leaves CEM to act.
 
         :param max_steps: largest number of gradient steps
         :param batch_size: observations per gradient step, by default the model's

@@ -24,6 +24,7 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
+from tqdm import tqdm
 
 from sb3_cgp import CGP, HParamsCallback, TrainingCheckpointCallback
 from sb3_cgp.resumption.fingerprints import fingerprint
@@ -358,6 +359,33 @@ def test_an_environment_that_is_not_vectorised_is_saved_with_its_callback(tmp_pa
         CGP("MlpPolicy", "Pendulum-v1", **TINY).learn(20, callbacks)
     with pytest.warns(UserWarning, match="Stepping's `env` was not saved: its episodes will be other ones"):
         CGP.resume(tmp_path / "other", "Pendulum-v1").learn(30, Stepping(Doubles()))
+
+
+@pytest.mark.parametrize("inner", [lambda env: env, lambda env: env.unwrapped], ids=["outermost", "unwrapped"])
+def test_the_trainings_own_environment_is_not_saved_with_a_callback(inner, tmp_path):
+    class Looking(BaseCallback):
+        def _on_step(self):
+            self.env = inner(self.training_env.envs[0])
+            return True
+
+    with pytest.warns(UserWarning, match="cannot be saved") as warned:
+        CGP("MlpPolicy", Doubles(), **TINY).learn(20, [Looking(), TrainingCheckpointCallback(10, tmp_path)])
+    assert [str(each.message) for each in warned if "Looking" in str(each.message)] == []
+
+
+def test_progress_bars_of_a_callback_are_not_missed(tmp_path):
+    class Showing(BaseCallback):
+        def _on_training_start(self):
+            self.bar = tqdm(disable=True)
+            self.bar.n = 0
+
+        def _on_step(self):
+            self.bar.n += 1
+            return True
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*is not saved")
+        CGP("MlpPolicy", "Pendulum-v1", **TINY).learn(20, [Showing(), TrainingCheckpointCallback(10, tmp_path)])
 
 
 def test_declared_states_may_be_anything_that_is_plain_data(tmp_path):

@@ -51,9 +51,9 @@ def test_a_pending_value_of_any_type_is_kept_or_left_out(value, expected, tmp_pa
     model = make_model()
     model.learn(9, [TrainingCheckpointCallback(9, tmp_path), Do(9, log)], log_interval=100)
     kept = CGP.resume(tmp_path, make_vec_env("Pendulum-v1")).resumption["logger"]
-    found = kept["name_to_value"].get("Key.PHASE")
+    found = kept["name_to_value"].get("phase")
     assert (found, type(found)) == (expected, type(expected))
-    assert kept["name_to_excluded"].get("Key.PHASE") == (None if expected is None else ("stdout",))
+    assert kept["name_to_excluded"].get("phase") == (None if expected is None else ("stdout",))
     assert (kept["name_to_value"]["other"], kept["name_to_count"]) == (3.0, {"other": 1})
 
 

@@ -285,6 +285,10 @@ def test_an_array_that_shares_memory_is_an_obstacle():
     task = env.envs[0].unwrapped
     task.height, task.limits = task.height.copy(), task.limits.copy()
     assert obstacles(env) == []
+    # An environment that has just been made may share what this one does not
+    again = make(Viewing, 1, n_envs=1)
+    restore_environment(again, environment_state(env))
+    np.testing.assert_array_equal(again.envs[0].unwrapped.limits, task.limits)
 
 
 class Adapter(gym.Env):

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cgp.common.sb3_arguments import constructor_argument_names
 from sb3_cgp.resumption.declarations import METHODS
-from sb3_cgp.resumption.environments import restore_environment, state_and_obstacles
+from sb3_cgp.resumption.environments import is_part_of, restore_environment, state_and_obstacles
 from sb3_cgp.resumption.fingerprints import LEFT_OUT, fingerprint
 from sb3_cgp.resumption.plain_data import declared_state, from_plain, plain_attributes, set_plain_attributes
 
@@ -19,6 +19,8 @@ State = dict[str, Any]
 Fingerprints = dict[str, bytes | None]
 # The attributes of every callback of SB3, which follow from the training
 COMMON = {"n_calls", "num_timesteps", "verbose", "locals", "globals", "parent"}
+# Packages whose objects show a training's progress, and are made anew
+FOR_PEOPLE = {"tqdm", "rich", "matplotlib", "optuna"}
 
 
 class Start(NamedTuple):
@@ -143,7 +145,7 @@ def _callback_state(callback: BaseCallback, training_env: VecEnv, start: Start, 
     changed = {name for name, value in now.items() if value is not None} - unchanged if start.attributes else set()
     for name in sorted(changed - state["attributes"].keys() - state["environments"].keys()):
         value = vars(callback)[name]
-        if not isinstance(value, LEFT_OUT):
+        if not isinstance(value, LEFT_OUT) and type(value).__module__.split(".")[0] not in FOR_PEOPLE:
             reason = "an argument of its constructor" if name in unsaved else f"a {type(value).__qualname__}, not plain data"
             problems.append(
                 f"{type(callback).__name__}'s `{name}`, which has changed in the training, is not saved, as it is {reason}. A "
@@ -163,7 +165,7 @@ def _unsaved(callback: BaseCallback) -> set[str]:
 
 def _environments(callback: BaseCallback, training_env: VecEnv) -> dict[str, VecEnv | gym.Env]:
     found = {name: value for name, value in vars(callback).items() if isinstance(value, VecEnv | gym.Env)}
-    return {name: value for name, value in found.items() if value is not training_env}
+    return {name: value for name, value in found.items() if value is not training_env and not is_part_of(value, training_env)}
 
 
 def _class_name(thing: object) -> str:

@@ -35,7 +35,7 @@ from stable_baselines3.common.vec_env.stacked_observations import StackedObserva
 from sb3_cgp.common.rules import require
 from sb3_cgp.resumption.declarations import METHODS, find_declaration, pickle_declarations, unpickle_declarations
 from sb3_cgp.resumption.differences import require_same, warn_of_other_arguments
-from sb3_cgp.resumption.layers import is_known, layer_state, set_layer_state
+from sb3_cgp.resumption.layers import SHARES, is_known, layer_state, set_layer_state
 from sb3_cgp.resumption.replayed import ReplayedEnv
 
 
@@ -87,13 +87,18 @@ def state_and_obstacles(env: VecEnv | gym.Env) -> tuple[dict[str, Any] | None, l
         and a sentence or two for each obstacle, with what would help
     :raises ValueError: if a ``get_training_state()`` returns anything but plain data
     """
+    state, problems = _state(env)
+    return None if problems else state, problems
+
+
+def _state(env: VecEnv | gym.Env) -> tuple[dict[str, Any], list[str]]:
     problems: list[str] = []
     layers, envs = _parts(env)
     states = [layer_state(layer, problems) for layer in layers]
     in_processes = layers and isinstance(layers[-1], SubprocVecEnv)
     chains = _states_in_processes(layers[-1], problems) if in_processes else [_chain_state(each, problems) for each in envs]
     state = {"num_envs": 1 if isinstance(env, gym.Env) else env.num_envs, "layers": states, "envs": chains}
-    return None if problems else state, list(dict.fromkeys(problems))
+    return state, list(dict.fromkeys(problems))
 
 
 def environment_state(env: VecEnv | gym.Env) -> dict[str, Any] | None:
@@ -130,12 +135,12 @@ def restore_environment(env: VecEnv | gym.Env, state: dict[str, Any]) -> None:
     :param state: the state that :func:`environment_state` returned
     :raises ValueError: if the state is that of another environment; ``env`` is then not changed
     """
-    current, problems = state_and_obstacles(env)
+    current, found = _state(env)
+    layers, envs = _parts(env)
+    problems = [each for each in found if SHARES not in each] if envs else found
     require(not problems, "env", env, f"restorable: {' '.join(problems)}")
-    assert current is not None
     require_same(current, state)
     warn_of_other_arguments(current, state)
-    layers, envs = _parts(env)
     for layer, saved in zip(layers, state["layers"], strict=True):
         set_layer_state(layer, saved)
     for index, chain_state in enumerate(state["envs"]):
@@ -178,6 +183,17 @@ def _parts(env: VecEnv | gym.Env) -> tuple[list[Any], list[gym.Env]]:
         return [], [env]
     layers = list(_vec_layers(env))
     return layers, layers[-1].envs if isinstance(layers[-1], DummyVecEnv) else []
+
+
+def is_part_of(env: VecEnv | gym.Env, whole: VecEnv) -> bool:
+    """
+    Return whether an environment is one of a vectorised environment's, or a layer of one.
+
+    :param env: the environment
+    :param whole: the vectorised environment
+    :return: whether it is; False for environments in other processes
+    """
+    return any(layer is env for each in _parts(whole)[1] for layer in _chain(each))
 
 
 def _vec_layers(env: VecEnv) -> Iterator[Any]:

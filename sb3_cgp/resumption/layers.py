@@ -71,6 +71,8 @@ UNSAVED = {
 INFOS = {"buf_infos", "reset_infos"}
 # Of a checker whose last infos are no plain data: its checks of the first two steps, which only warn, are skipped
 CHECKED = {"_previous_data": None, "checked_step": True, "checked_data_reuse": True}
+# Of an obstacle to saving a state, which is none to restoring one: that it was saved shows that nothing shared memory then
+SHARES = "shares memory with"
 RANDOM_STATE = {"_np_random", "_np_random_seed"}
 # They do not change their MuJoCo models; environments of others may
 CONSTANT_MODELS = "gymnasium.envs.mujoco."
@@ -187,7 +189,7 @@ def _shared(layer: Any, name: str) -> list[str]:
         if array is not view and np.shares_memory(array, view):
             others.setdefault(other, f"its {key}")
     remedy = f"it has to be a copy, or the class needs {METHODS}"
-    return [f"{name}.{key} shares memory with {other}: {remedy}." for key, other in others.items()]
+    return [f"{name}.{key} {SHARES} {other}: {remedy}." for key, other in others.items()]
 
 
 def _is_stateless(value: Any) -> bool:

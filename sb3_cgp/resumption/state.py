@@ -144,8 +144,8 @@ def _pending(logger: Logger) -> State:
     plain = {key: _plain_logged(value) for key, value in logger.name_to_value.items()}
     kept = [key for key, value in plain.items() if value is not None]
     recorded = {"name_to_value": plain, "name_to_count": logger.name_to_count, "name_to_excluded": logger.name_to_excluded}
-    # Keys may be of an enumeration, too
-    return {name: {str(key): values[key] for key in kept if key in values} for name, values in recorded.items()}
+    # Keys may be of an enumeration, too, whose member is equal to its string, and not to what `str` returns
+    return {name: {str.__str__(key): values[key] for key in kept if key in values} for name, values in recorded.items()}
 
 
 def _plain_logged(value: Any) -> Any:
