@@ -159,8 +159,8 @@ def test_the_sizes_of_populations_are_those_of_the_documentation(tmp_path):
         found = Counter(common_settings(run) for run in load_sweep(step.command[3], dict(tasks=tasks), methods).runs())
         found.pop(None, 0)
         sizes[step.name] = str(max(found.values()))
-    text = (ROOT / "docs" / "population.md").read_text()
-    assert {name: size for size, name in re.findall(r"(\d+)(?: agents)? in `(e\d)`", text)} == sizes
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    assert {name: size for size, name in re.findall(r"(\d+)(?: agents)? in\s+`(e\d)`", text)} == sizes
 
 
 def test_what_is_done_is_skipped_and_what_has_failed_is_repeated_on_demand(tmp_path, monkeypatch):
