@@ -14,16 +14,8 @@ from sb3_cgp.selectors.policies import CGPPolicy
 from sb3_cgp.selectors.proposals import ActorStart, check_start, takes_proposals
 
 STARTS = ("prior", "actor")
-# The arguments of which the selector is made
-CEM_ARGUMENTS = (
-    "cem_iterations",
-    "cem_samples",
-    "cem_elites",
-    "cem_result",
-    "cem_start",
-    "cem_actor_fraction",
-    "cem_actor_std",
-)
+# The arguments of which the selector is made, with their defaults
+CEM_ARGUMENTS = {"cem_start": "prior"} | {f"cem_{name}": value for name, value in (vars(ActorCEM()) | vars(CEM())).items()}
 
 
 class SelectorAlgorithm(CGP):
@@ -63,10 +55,7 @@ class SelectorAlgorithm(CGP):
             allowed = "'prior' with a selector of `policy_kwargs` or of the policy's class, which replaces CEM"
             require(self._selector_is_made_here, "cem_start", self.cem_start, allowed)
         self._check_selector()
-        defaults = {name: getattr(type(self), name, None) for name in CEM_ARGUMENTS} | {
-            f"cem_{name}": value for name, value in vars(CEM()).items()
-        }
-        self._warn_if_replaced(*(name for name, default in defaults.items() if getattr(self, name) != default))
+        self._warn_if_replaced(*(name for name, default in CEM_ARGUMENTS.items() if getattr(self, name) != default))
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         # One may have been set on the policy
