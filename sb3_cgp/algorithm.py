@@ -218,23 +218,16 @@ class CGP(
         given = self.policy_kwargs.get("cem_dtype")
         require(given is None, "policy_kwargs['cem_dtype']", given, "given as `cem_dtype`, outside `policy_kwargs`")
         super()._setup_model()
-        self.policy.cem_dtype = self.cem_dtype  # type: ignore[assignment]
+        self._follow_argument("cem_dtype")
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
         require_choice("cem_dtype", self.cem_dtype, SCORING_DTYPES)
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        """
-        Set an attribute, see :meth:`sb3_cgp.selectors.algorithm.SelectorAlgorithm.__setattr__`.
-
-        :param name: the attribute's name
-        :param value: its value
-        :raises ValueError: if the argument is out of its range or contradicts another one
-        """
-        super().__setattr__(name, value)
-        if name == "cem_dtype" and "policy" in vars(self):
-            self.policy.cem_dtype = value
+    def _follow_argument(self, name: str) -> None:
+        super()._follow_argument(name)
+        if name == "cem_dtype":
+            self.policy.cem_dtype = self.cem_dtype  # type: ignore[assignment]
 
     @suggests_names
     def learn(

@@ -111,8 +111,13 @@ class SelectorAlgorithm(CGP):
             raise
         if not is_made_here and name in CEM_ARGUMENTS:
             self._warn_if_replaced(name)
-        # Not with every argument: the user may have chosen otherwise on the policy
-        if name == "inference" or self._has_actor != had_actor:
+        if self._has_actor != had_actor:
+            self._choose_inference()
+        self._follow_argument(name)
+
+    def _follow_argument(self, name: str) -> None:
+        """Set what the policy has of an argument that has changed; of others, the user may have chosen otherwise on it."""
+        if name == "inference":
             self._choose_inference()
 
     def _check_arguments(self) -> None:
