@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import gymnasium as gym
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_cgp.guards.explanations import check_reset_info
 from sb3_cgp.guards.observations import innermost
@@ -40,7 +40,7 @@ class DummyVecEnvGuard(OffPolicyAlgorithm):
             return super().learn(*args, **kwargs)
         with ExitStack() as stack:
             # A private method, as nothing outside of the environment sees an observation before it is collected
-            observer = _ObservationObserver(env, self, is_clipped=_is_clipped(self.env))
+            observer = _ObservationObserver(env, self, is_clipped=_sees_raw(self.get_vec_normalize_env()))
             stack.enter_context(_shadowed(env, "_save_obs", observer.save))
             for index, each in enumerate(env.envs):
                 stack.enter_context(_shadowed(each, "reset", functools.partial(observer.reset, index, each.reset)))
@@ -94,9 +94,10 @@ class _ObservationObserver:
             model = None if self._model is None else self._model()
             if model is not None:
                 space, timestep = self._env.observation_space, model.num_timesteps + self._env.num_envs
-                check_shape("terminal observation", final, space, None, timestep)
                 if self._is_clipped:
                     check_final_observation(final, space, timestep)
+                else:
+                    check_shape("terminal observation", final, space, None, timestep)
             info["terminal_observation"] = copy.deepcopy(final)
         return reset(*args, **kwargs)
 
@@ -104,11 +105,9 @@ class _ObservationObserver:
         return vars(self) | {"_model": None}
 
 
-def _is_clipped(env: VecEnv | None) -> bool:
+def _sees_raw(normalizer: VecNormalize | None) -> bool:
     """Return whether a ``VecNormalize`` receives the observations of a ``DummyVecEnv``, which no other wrapper changes."""
-    while isinstance(env, VecEnvWrapper) and not isinstance(env, VecNormalize):
-        env = env.venv
-    inner = env.venv if isinstance(env, VecNormalize) else None
+    inner = None if normalizer is None else normalizer.venv
     while isinstance(inner, VecMonitor):
         inner = inner.venv
     return isinstance(inner, DummyVecEnv)
