@@ -23,7 +23,8 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnMaxEpisodes,
 )
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 from tqdm import tqdm
 
 from sb3_cgp import CGP, HParamsCallback, TrainingCheckpointCallback
@@ -361,15 +362,20 @@ def test_an_environment_that_is_not_vectorised_is_saved_with_its_callback(tmp_pa
         CGP.resume(tmp_path / "other", "Pendulum-v1").learn(30, Stepping(Doubles()))
 
 
-@pytest.mark.parametrize("inner", [lambda env: env, lambda env: env.unwrapped], ids=["outermost", "unwrapped"])
+@pytest.mark.parametrize(
+    "inner",
+    [lambda env: env.venv, lambda env: env.venv.envs[0], lambda env: env.venv.envs[0].unwrapped],
+    ids=["vectorised", "outermost", "unwrapped"],
+)
 def test_the_trainings_own_environment_is_not_saved_with_a_callback(inner, tmp_path):
     class Looking(BaseCallback):
         def _on_step(self):
-            self.env = inner(self.training_env.envs[0])
+            self.env = inner(self.training_env)
             return True
 
+    env = VecMonitor(DummyVecEnv([lambda: Monitor(Doubles())]))
     with pytest.warns(UserWarning, match="cannot be saved") as warned:
-        CGP("MlpPolicy", Doubles(), **TINY).learn(20, [Looking(), TrainingCheckpointCallback(10, tmp_path)])
+        CGP("MlpPolicy", env, **TINY).learn(20, [Looking(), TrainingCheckpointCallback(10, tmp_path)])
     assert [str(each.message) for each in warned if "Looking" in str(each.message)] == []
 
 

@@ -164,8 +164,9 @@ def _unsaved(callback: BaseCallback) -> set[str]:
 
 
 def _environments(callback: BaseCallback, training_env: VecEnv) -> dict[str, VecEnv | gym.Env]:
+    """Return the environments of a callback by attribute, without the training's own."""
     found = {name: value for name, value in vars(callback).items() if isinstance(value, VecEnv | gym.Env)}
-    return {name: value for name, value in found.items() if value is not training_env and not is_part_of(value, training_env)}
+    return {name: value for name, value in found.items() if not is_part_of(value, training_env)}
 
 
 def _class_name(thing: object) -> str:

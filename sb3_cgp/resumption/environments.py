@@ -187,13 +187,14 @@ def _parts(env: VecEnv | gym.Env) -> tuple[list[Any], list[gym.Env]]:
 
 def is_part_of(env: VecEnv | gym.Env, whole: VecEnv) -> bool:
     """
-    Return whether an environment is one of a vectorised environment's, or a layer of one.
+    Return whether an environment is a vectorised environment, one of its wrappers or environments, or a layer of one.
 
     :param env: the environment
     :param whole: the vectorised environment
     :return: whether it is; False for environments in other processes
     """
-    return any(layer is env for each in _parts(whole)[1] for layer in _chain(each))
+    layers, envs = _parts(whole)
+    return any(env is each for each in layers) or any(env is layer for each in envs for layer in _chain(each))
 
 
 def _vec_layers(env: VecEnv) -> Iterator[Any]:
