@@ -152,7 +152,7 @@ class Sweep:
 
 def difference(was: dict[str, dict[str, Any]] | None, now: dict[str, dict[str, Any]]) -> tuple[str, str] | None:
     """
-    Find what methods have in common now, and had not before.
+    Return the first hyperparameter or axis of all methods that differs from that of an earlier command.
 
     :param was: :attr:`Sweep.shared` of an earlier command; None if it was not recorded
     :param now: the same of this command
