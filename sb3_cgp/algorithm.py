@@ -11,7 +11,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
-from sb3_cgp.common.rules import require, require_choice
+from sb3_cgp.common.rules import require
 from sb3_cgp.core import cgp as core
 from sb3_cgp.core.policies import CGPPolicy
 from sb3_cgp.diagnostics import DiagnosticsAlgorithm
@@ -20,14 +20,13 @@ from sb3_cgp.export.write import export_policy
 from sb3_cgp.fast.cuda_graph_algorithm import CudaGraphAlgorithm
 from sb3_cgp.fast.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_cgp.fast.replay import LeanReplayAlgorithm
-from sb3_cgp.fast.scoring import SCORING_DTYPES
+from sb3_cgp.fast.scoring_algorithm import ScoringAlgorithm
 from sb3_cgp.guards.algorithm import GuardedAlgorithm
 from sb3_cgp.guards.arguments import check_callback
 from sb3_cgp.guards.construction import checks_arguments
 from sb3_cgp.guards.losses import LossGuard
 from sb3_cgp.guards.names import suggests_names
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
-from sb3_cgp.selectors.algorithm import SelectorAlgorithm
 
 SelfCGP = TypeVar("SelfCGP", bound="CGP")
 
@@ -40,7 +39,7 @@ class CGP(
     CudaGraphAlgorithm,
     LossGuard,
     LeanReplayAlgorithm,
-    SelectorAlgorithm,
+    ScoringAlgorithm,
     core.CGP,
 ):
     """
@@ -124,7 +123,6 @@ class CGP(
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
-    changeable_arguments: ClassVar[tuple[str, ...]] = (*SelectorAlgorithm.changeable_arguments, "cem_dtype")
 
     @checks_arguments
     def __init__(
@@ -213,21 +211,6 @@ class CGP(
             device=device,
             _init_setup_model=_init_setup_model,
         )
-
-    def _setup_model(self) -> None:
-        given = self.policy_kwargs.get("cem_dtype")
-        require(given is None, "policy_kwargs['cem_dtype']", given, "given as `cem_dtype`, outside `policy_kwargs`")
-        super()._setup_model()
-        self._follow_argument("cem_dtype")
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        require_choice("cem_dtype", self.cem_dtype, SCORING_DTYPES)
-
-    def _follow_argument(self, name: str) -> None:
-        super()._follow_argument(name)
-        if name == "cem_dtype":
-            self.policy.cem_dtype = self.cem_dtype  # type: ignore[assignment]
 
     @suggests_names
     def learn(

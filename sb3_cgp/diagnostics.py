@@ -81,11 +81,9 @@ class DiagnosticsAlgorithm(CGP):
         if self._n_updates // INTERVAL > n_updates // INTERVAL:
             self._log_diagnostics(batch_size, self._trains_online)
 
-    def _record_means(self, values: dict[str, list[th.Tensor]]) -> None:
-        super()._record_means(values)
-        # The losses of a round of offline policy training
-        if values.keys() == {"actor_loss"}:
-            self._log_diagnostics(self.batch_size, has_actor=True)
+    def _record_round(self, losses: list[th.Tensor]) -> None:
+        super()._record_round(losses)
+        self._log_diagnostics(self.batch_size, has_actor=True)
 
     def _log_diagnostics(self, batch_size: int, has_actor: bool) -> None:
         if not self.diagnostics:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
+from sb3_cgp.resumption.environments import restore_environment, state_and_obstacles
 
 PLAIN_SCALARS = (type(None), bool, int, float, str, bytes)
 
@@ -57,6 +57,16 @@ def go_on(env, steps):
             # Time on the clock
             info.get("episode", {}).pop("t", None)
     return [*seen, deepcopy(env.reset()), [env.action_space.sample(), env.observation_space.sample()]]
+
+
+def environment_state(env):
+    """Return the state of an environment, or None if it cannot be restored."""
+    return state_and_obstacles(env)[0]
+
+
+def obstacles(env):
+    """Return what prevents an environment from being restored."""
+    return state_and_obstacles(env)[1]
 
 
 def start(env, steps):

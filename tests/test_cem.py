@@ -5,6 +5,7 @@ import pytest
 import torch as th
 
 from sb3_cgp import CEM
+from sb3_cgp.core.cem import find_elites
 
 
 def quadratic(peak: th.Tensor):
@@ -110,6 +111,12 @@ def test_nan_is_never_an_elite():
     assert th.all(actions < 0)
     assert th.all(selection.std.isfinite())
     assert actions.flatten().tolist() == pytest.approx([-0.5] * 8, abs=0.05)
+
+
+@pytest.mark.parametrize("n_elites", [1, 2, 3, 4])
+def test_nan_ranks_below_every_number(n_elites):
+    values = th.tensor([[th.nan, -th.inf, 1.0, th.inf], [-th.inf, 2.0, th.nan, -3.0]])
+    assert find_elites(values, n_elites)[..., 0].tolist() == [[3, 2, 1, 0][:n_elites], [1, 3, 0, 2][:n_elites]]
 
 
 @pytest.mark.parametrize(

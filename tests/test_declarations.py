@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from environment_states import assert_same as assert_same_values
-from environment_states import check, go_on, start
+from environment_states import check, environment_state, go_on, obstacles, start
 from environments import Doubles
 from gymnasium import spaces
 from gymnasium.envs.classic_control import PendulumEnv
@@ -22,7 +22,7 @@ from trainings import Training, assert_same, fingerprint
 from sb3_cgp import RestorableEnv, register_restorable
 from sb3_cgp.resumption import declarations
 from sb3_cgp.resumption.declarations import METHODS
-from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
+from sb3_cgp.resumption.environments import restore_environment
 
 
 class Foreign(Doubles):

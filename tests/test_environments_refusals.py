@@ -4,11 +4,11 @@ import warnings
 
 import numpy as np
 import pytest
-from environment_states import PENDULUM, assert_same, make_task, start
+from environment_states import PENDULUM, assert_same, environment_state, make_task, start
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecNormalize
 
-from sb3_cgp.resumption.environments import RestorableEnv, environment_state, restore_environment
+from sb3_cgp.resumption.environments import RestorableEnv, restore_environment
 
 
 @pytest.mark.parametrize(

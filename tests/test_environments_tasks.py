@@ -5,9 +5,9 @@ from functools import partial
 import mujoco
 import numpy as np
 import pytest
-from environment_states import assert_same, check, make_task, start
+from environment_states import assert_same, check, environment_state, make_task, start
 
-from sb3_cgp.resumption.environments import environment_state, restore_environment
+from sb3_cgp.resumption.environments import restore_environment
 
 MUJOCO_TASKS = (
     *("Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "InvertedDoublePendulum", "InvertedPendulum"),

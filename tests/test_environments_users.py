@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from environment_states import PENDULUM, check
+from environment_states import PENDULUM, check, environment_state, obstacles
 from environments import Doubles
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecExtractDictObs, VecFrameStack, VecNormalize, VecTransposeImage
 
-from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
+from sb3_cgp.resumption.environments import restore_environment
 
 
 class Goal(Doubles):

@@ -5,14 +5,14 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-from environment_states import PENDULUM, assert_same, check, go_on, start
+from environment_states import PENDULUM, assert_same, check, environment_state, go_on, start
 from gymnasium import wrappers
 from rl_zoo3 import wrappers as zoo_wrappers
 from rl_zoo3.utils import get_wrapper_class
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecCheckNan, VecFrameStack, VecMonitor, VecNormalize
 
-from sb3_cgp.resumption.environments import RestorableEnv, environment_state, restore_environment
+from sb3_cgp.resumption.environments import RestorableEnv, restore_environment
 
 
 class Total(gym.Wrapper):

@@ -5,7 +5,7 @@ import torch as th
 from guarded import SMALL, located
 from stable_baselines3 import TD3
 
-from sb3_cgp.guards import GuardedAlgorithm
+from sb3_cgp.guards.losses import LossGuard
 
 
 class Descending(TD3):
@@ -22,7 +22,7 @@ class Descending(TD3):
             self._descend("critic", th.tensor(loss))
 
 
-class Guarded(GuardedAlgorithm, Descending):
+class Guarded(LossGuard, Descending):
     pass
 
 

@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from environment_states import obstacles
 from environments import Doubles
 from filelock import FileLock
 from stable_baselines3 import TD3
@@ -27,7 +28,6 @@ from sb3_cgp import CGP
 from sb3_cgp.common.files import write_atomically
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer
 from sb3_cgp.resumption import FolderInUseError, TrainingCheckpointCallback, locks, resumable
-from sb3_cgp.resumption.environments import obstacles
 from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.replay_buffers import fill_replay_buffer, replay_buffer_state
 

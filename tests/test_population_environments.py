@@ -5,6 +5,7 @@ import multiprocessing
 import gymnasium as gym
 import numpy as np
 import pytest
+from environment_states import environment_state, obstacles
 from environments import Doubles
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -14,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from sb3_cgp import RestorableEnv, TrainingCheckpointCallback
 from sb3_cgp.population import ChunkedSubprocVecEnv, Population, make_environments, make_population_env
 from sb3_cgp.population.processes import chunk_bounds
-from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
+from sb3_cgp.resumption.environments import restore_environment
 
 # A forked process starts at once; the tests use no threads
 FORK = dict(start_method="fork")

@@ -5,7 +5,7 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-from environment_states import assert_plain, check, start
+from environment_states import assert_plain, check, environment_state, obstacles, start
 from environments import Doubles
 from gymnasium import spaces
 from rl_zoo3.utils import get_wrapper_class
@@ -15,7 +15,7 @@ from trainings import Training, assert_same, fingerprint
 
 from sb3_cgp import RestorableEnv
 from sb3_cgp.resumption import ReplayedEnv, replayed
-from sb3_cgp.resumption.environments import environment_state, obstacles, restore_environment
+from sb3_cgp.resumption.environments import restore_environment
 from sb3_cgp.resumption.plain_data import to_plain
 
 

@@ -11,7 +11,7 @@ from benchmark import tune
 from benchmark.sweeps.experiments import Sweep
 from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.studies import Ledger
-from benchmark.sweeps.study_trials import KEY, distributions_of, with_seed
+from benchmark.sweeps.study_trials import KEY
 from benchmark.sweeps.sweep_files import SweepFile
 from benchmark.sweeps.validation import SweepError
 from benchmark.worker import open_ledger as open_ledger_of_worker
@@ -143,21 +143,6 @@ def test_a_trial_shows_its_name_and_its_seed_and_the_seed_is_no_parameter(ledger
     assert [set(trial.params) for trial in ledger.trials()] == [{"method", "task"}] * 3
     assert [trial.user_attrs["seed"] for trial in ledger.trials()] == [0, 1, 2]
     assert ledger.trials()[0].user_attrs[KEY] == "Good,Pendulum-v1,seed=0"
-
-
-def test_a_study_of_an_earlier_version_goes_on_with_the_seed_as_a_parameter(monkeypatch):
-    storage = InMemoryStorage()
-    with monkeypatch.context() as patch:
-        patch.setattr("benchmark.sweeps.studies.distributions_of", lambda sweep: with_seed(distributions_of(sweep)))
-        first = open_ledger(storage, Clock())
-    assert [trial.params["seed"] for trial in first.trials()] == [0, 1, 2]
-    claim = first.claim("worker")
-    first.release(claim)
-    later = open_ledger(storage, Clock(), seeds=4)
-    assert [trial.params["seed"] for trial in later.trials()] == [0, 1, 2, 0, 3]
-    assert len({str(trial.distributions) for trial in later.trials()}) == 1
-    with pytest.raises(SweepError, match="has other methods, tasks or axes"):
-        open_ledger(storage, Clock(), tasks=["Reacher-v5"])
 
 
 def test_hyperparameters_that_json_changes_are_the_same(ledger):

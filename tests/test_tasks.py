@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from environment_states import environment_state
 from gymnasium.utils.env_checker import check_env as check_by_gymnasium
 from stable_baselines3 import TD3
 from stable_baselines3.common.env_checker import check_env as check_by_sb3
@@ -18,7 +19,7 @@ from benchmark.tasks.landscape import KnownMaxima
 from benchmark.tasks.registration import LANDSCAPES, ORIGINALS
 from benchmark.tasks.zones import AllowedZones, unit_radius
 from sb3_cgp import CEM, CGP
-from sb3_cgp.resumption.environments import environment_state, restore_environment
+from sb3_cgp.resumption.environments import restore_environment
 
 RESTRICTED = [f"Restricted{original}" for original in ORIGINALS]
 TASKS = [*RESTRICTED, *LANDSCAPES]

@@ -8,6 +8,9 @@ from typing import Any
 
 from sb3_cgp.common.files import write_atomically
 
+# What a user can do about the damaged record of a training
+RETRAIN = "Move it away, and give the same command again, which trains its run anew."
+
 
 def write_json(path: Path, record: dict[str, Any]) -> None:
     """

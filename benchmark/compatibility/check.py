@@ -34,7 +34,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_cgp import CGP, TrainingCheckpointCallback
-from sb3_cgp.resumption.environments import obstacles
+from sb3_cgp.resumption.environments import state_and_obstacles
 
 # Hindsight replay needs an ended episode after the random steps, hence more than 100, the length of many. The stop is within
 # an episode of 50 or 100 steps, and before the end of another.
@@ -195,6 +195,7 @@ def within(actions: np.ndarray, space: spaces.Box) -> bool:
 
     :param actions: shape (B, *action)
     :param space: the space of one action
+    :return: whether all of them are allowed
     """
     return all(space.contains(action.astype(space.dtype)) for action in actions)
 
@@ -243,7 +244,7 @@ def whole(environment: dict[str, Any], folder: Path, report: Report) -> None:
         report.write(at_stop=watch.at_stop, at_end=fingerprint(model), steps_per_second=watch.steps_per_second)
     if report.known["errors"]:
         return
-    report.write(why_not_restorable=" ".join(obstacles(env)) or None)
+    report.write(why_not_restorable=" ".join(state_and_obstacles(env)[1]) or None)
     with report.doing("steps"):
         started, steps = time.process_time(), 0
         while steps < ALONE and time.process_time() - started < 3:

@@ -141,21 +141,20 @@ def estimate(step: StepOperations, n_agents: int, card: Card, costs: Costs) -> d
     }
 
 
-def estimate_all(methods: Iterable[str], numbers: Iterable[int], card: Card = H100) -> dict[str, Any]:
+def estimate_all(methods: Iterable[str], numbers: Iterable[int]) -> dict[str, Any]:
     """
-    Count the operators of populations, and estimate their speeds on a GPU.
+    Count the operators of populations, and estimate their speeds on an NVIDIA H100.
 
     :param methods: the methods
     :param numbers: the numbers of agents
-    :param card: the GPU
     :return: the card, the costs, and under "points", counts and estimates by method and number
     """
-    costs = derive_costs(card)
+    costs = derive_costs(H100)
     numbers = list(numbers)
     points = []
     for method in methods:
         for n_agents in numbers:
             step = count_step(method, n_agents)
             counts = step.per_gradient_step() | {"acting_operators": len(step.acting)}
-            points.append({"method": method, "n_agents": n_agents, "counts": counts, **estimate(step, n_agents, card, costs)})
-    return {"card": asdict(card), "costs": asdict(costs), "points": points}
+            points.append({"method": method, "n_agents": n_agents, "counts": counts, **estimate(step, n_agents, H100, costs)})
+    return {"card": asdict(H100), "costs": asdict(costs), "points": points}

@@ -8,7 +8,7 @@ from typing import Any
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from benchmark.common.files import file_name, read_json, write_json
+from benchmark.common.files import RETRAIN, file_name, read_json, write_json
 from benchmark.common.provenance import conditions
 from benchmark.common.records import EVALUATION_SEED
 from benchmark.common.zoo import read_entry, shortened_warm_up
@@ -73,8 +73,7 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
     :return: the records, by task, data type and seed
     :raises ValueError: if one is damaged; it names the file and the remedy
     """
-    remedy = "Move it away, and give the same command again, which trains its run anew."
-    records = [read_json(path, ("env", "dtype", "seed"), remedy) for path in folder.glob("[!.]*_seed*.json")]
+    records = [read_json(path, ("env", "dtype", "seed"), RETRAIN) for path in folder.glob("[!.]*_seed*.json")]
     return sorted(records, key=lambda record: (record["env"], record["dtype"], record["seed"]))
 
 

@@ -20,8 +20,7 @@ MOST = 3
 # Errors that every run of the machine would have
 OF_ALL_RUNS = (
     *(*STORAGE_ERRORS, ImportError, DependencyNotInstalled, PermissionError, FileExistsError),
-    # Of a GPU; PyTorch has it since 2.8
-    *([th.AcceleratorError] if hasattr(th, "AcceleratorError") else []),
+    th.AcceleratorError,
 )
 # Of a disk that is full, read-only, broken or gone, and of too many open files
 SYSTEM_ERRORS = (

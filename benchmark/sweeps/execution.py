@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import get_device
 from benchmark.common.provenance import conditions
 from benchmark.sweeps.experiments import Sweep
 from benchmark.sweeps.exports import check_no_run_is_lost, ended_runs, export_study, without_places
-from benchmark.sweeps.processes import INTERVAL, start_workers, stop
+from benchmark.sweeps.processes import INTERVAL, start_workers, stopping
 from benchmark.sweeps.progress import ProgressTracker, display
 from benchmark.sweeps.runs import overview
 from benchmark.sweeps.signals import end_if_asked
@@ -95,7 +95,7 @@ def execute(sweep: Sweep, storage: BaseStorage, study: str, args: argparse.Names
     n_workers = args.workers if ledger.left() else 0
     workers = start_workers(worker_command(args, study), n_workers, args.threads, args.logs / study)
     try:
-        with display(study) as show:
+        with stopping(workers), display(study) as show:
             while True:
                 # Workers search for lost processes between their runs only
                 ledger.recover()
@@ -105,10 +105,6 @@ def execute(sweep: Sweep, storage: BaseStorage, study: str, args: argparse.Names
                     break
                 time.sleep(INTERVAL)
                 end_if_asked()
-    except BaseException:
-        stop(workers)
-        print("Stopped. The same command continues.", file=sys.stderr)
-        raise
     finally:
         folder = export_study(study, args.storage, args.results)
     left = ledger.left()

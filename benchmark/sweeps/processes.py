@@ -5,7 +5,8 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from benchmark.common.arguments import count, device_name, output_folder
@@ -103,12 +104,23 @@ def start_workers(command: Sequence[str], n_workers: int, threads: int, folder: 
     return workers
 
 
-def stop(workers: Sequence[subprocess.Popen[bytes]]) -> None:
+@contextmanager
+def stopping(workers: Sequence[subprocess.Popen[bytes]]) -> Iterator[None]:
     """
-    End processes, which save the states of their runs before.
+    End processes if the ``with`` block ends by an error or a signal, and say how to continue.
 
     :param workers: the processes
     """
+    try:
+        yield
+    except BaseException:
+        _stop(workers)
+        print("Stopped. The same command continues.", file=sys.stderr)
+        raise
+
+
+def _stop(workers: Sequence[subprocess.Popen[bytes]]) -> None:
+    """End processes, which save the states of their runs before."""
     for worker in workers:
         if worker.poll() is None:
             worker.send_signal(signal.SIGTERM)

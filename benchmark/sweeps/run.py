@@ -40,9 +40,7 @@ RUN_FILE = "run.json"
 # Errors that are no fault of the run: of the database, the disk, a missing package, too little memory, or a GPU, which no
 # training of the same process can use after such an error
 MACHINE_ERRORS = (
-    *(*STORAGE_ERRORS, OSError, ImportError, DependencyNotInstalled, MemoryError, th.OutOfMemoryError),
-    # PyTorch has it since 2.8
-    getattr(th, "AcceleratorError", th.OutOfMemoryError),
+    *(*STORAGE_ERRORS, OSError, ImportError, DependencyNotInstalled, MemoryError, th.OutOfMemoryError, th.AcceleratorError),
 )
 
 

@@ -53,7 +53,6 @@ from benchmark.sweeps.study_trials import (
     distributions_of,
     owned,
     params_of,
-    with_seed,
 )
 from benchmark.sweeps.trial_writer import TrialWriter
 from benchmark.sweeps.validation import SweepError
@@ -93,9 +92,6 @@ class Ledger(TrialWriter):
             raise self._refusal("", "holds the trials of a tuning")
         self.refuse_unresolved()
         self._distributions = distributions_of(sweep)
-        if trials and trials[0].distributions == with_seed(self._distributions):
-            # Optuna gives all trials of a study the same parameters
-            self._distributions = with_seed(self._distributions)
         self._check(runs, trials)
         # Other methods than those of the runs
         if found := difference(attributes.get(SWEEP, {}).get(SHARED), sweep.shared):
@@ -172,7 +168,7 @@ class Ledger(TrialWriter):
                 keys.add(run.key)
                 trial = create_trial(
                     state=TrialState.WAITING,
-                    params=params_of(run, distributions),
+                    params=params_of(run),
                     distributions=distributions,
                     user_attrs=attributes_of(run),
                 )
@@ -199,7 +195,7 @@ class Ledger(TrialWriter):
             trial = create_trial(
                 state=TrialState.FAIL if record.final is None else TrialState.COMPLETE,
                 value=record.final,
-                params=params_of(run, self._distributions),
+                params=params_of(run),
                 distributions=self._distributions,
                 user_attrs=attributes_of(run) | progress | population | error | processors,
                 intermediate_values=dict(zip(record.timesteps, record.returns, strict=True)),

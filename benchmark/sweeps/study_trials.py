@@ -1,10 +1,10 @@
 """The trials of a study: the attributes that describe a run, and the rule which of a run's trials is its own."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
+from optuna.distributions import BaseDistribution, CategoricalDistribution
 from optuna.trial import FrozenTrial, TrialState
 
 from benchmark.common.records import Record
@@ -29,7 +29,7 @@ POPULATION = "population"
 # Of a trial that goes on from a state that another storage's trial has left: the time until then is not known
 CONTINUED = "continued"
 # The seed is an attribute, for optuna-dashboard to show and sort by. As a parameter, it would take part in the importances of
-# parameters. Studies that earlier versions began have it as a parameter, too.
+# parameters.
 SEED = "seed"
 
 
@@ -107,16 +107,14 @@ def processors_of(trials: Iterable[FrozenTrial]) -> list[str]:
     return sorted({name for names in named for name in names}) if all(named) else []
 
 
-def params_of(run: Run, distributions: Mapping[str, BaseDistribution]) -> dict[str, Any]:
+def params_of(run: Run) -> dict[str, Any]:
     """
     Return Optuna's parameters of a run.
 
     :param run: the run
-    :param distributions: the distributions of the study's parameters
-    :return: method, task and the values of the axes; in a study of an earlier version, the seed, too
+    :return: method, task and the values of the axes
     """
-    seed = {SEED: run.seed} if isinstance(distributions.get(SEED), IntDistribution) else {}
-    return {"method": run.method, "task": run.task, **run.settings, **seed}
+    return {"method": run.method, "task": run.task, **run.settings}
 
 
 def distributions_of(sweep: Sweep) -> dict[str, BaseDistribution]:
@@ -129,16 +127,6 @@ def distributions_of(sweep: Sweep) -> dict[str, BaseDistribution]:
     choices: dict[str, list[Any]] = {"method": list(sweep.file.methods), "task": sweep.file.tasks}
     choices |= {name: list(axis.values) for name, axis in sweep.file.axes.items()}
     return {name: CategoricalDistribution(values) for name, values in choices.items()}
-
-
-def with_seed(distributions: Mapping[str, BaseDistribution]) -> dict[str, BaseDistribution]:
-    """
-    Return the distributions of a study that an earlier version began.
-
-    :param distributions: those that a study has now
-    :return: the same, and any seed
-    """
-    return {**distributions, SEED: IntDistribution(0, 2**32 - 1)}
 
 
 def choices_of(trials: Sequence[FrozenTrial], name: str) -> list[Any]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from optuna.trial import FrozenTrial, TrialState
 
-from benchmark.sweeps.processes import INTERVAL, PAUSE, start_workers, stop
+from benchmark.sweeps.processes import INTERVAL, PAUSE, start_workers, stopping
 from benchmark.sweeps.signals import TERMINATED, end_if_asked
 from benchmark.sweeps.study_trials import ERROR
 from benchmark.sweeps.tuner import Tuner, best_of, has_ended
@@ -50,11 +50,10 @@ def tune(tuner: Tuner, study: str, args: argparse.Namespace, argv: Sequence[str]
     :return: the best trial
     :raises SystemExit: if no configuration was scored, or too few have ended
     """
-    workers = []
-    try:
-        if sum(map(has_ended, tuner.trials())) < args.trials:
-            command = [sys.executable, "-m", "benchmark.tune", *argv, "--parent", str(os.getpid())]
-            workers = start_workers(command, args.workers, args.threads, args.logs / study)
+    command = [sys.executable, "-m", "benchmark.tune", *argv, "--parent", str(os.getpid())]
+    n_workers = args.workers if sum(map(has_ended, tuner.trials())) < args.trials else 0
+    workers = start_workers(command, n_workers, args.threads, args.logs / study)
+    with stopping(workers):
         printed = ""
         while any(worker.poll() is None for worker in workers):
             # Workers search for lost processes between their configurations only
@@ -65,10 +64,6 @@ def tune(tuner: Tuner, study: str, args: argparse.Namespace, argv: Sequence[str]
                 printed = progress
             time.sleep(INTERVAL)
             end_if_asked()
-    except BaseException:
-        stop(workers)
-        print("Stopped. The same command continues.", file=sys.stderr)
-        raise
     trials = tuner.trials()
     best = best_of(trials)
     log = args.logs / study / "worker-*.log"

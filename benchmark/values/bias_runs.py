@@ -6,16 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmark.common.files import file_name, read_json, write_json
+from benchmark.common.files import RETRAIN, file_name, read_json, write_json
 from benchmark.common.provenance import conditions
 from benchmark.values.bias import BiasCallback
 from benchmark.values.methods import METHODS, make_model
 
 # The arguments that all records of a folder share, as they are compared
 SETTINGS = ("env", "units", "batch_size", "gamma", "tau", "steps", "learning_starts", "interval", "episodes", "episode_steps")
-
-# What a user can do about a damaged record
-REMEDY = "Move it away, and give the same command again, which trains its run anew."
 
 
 def run(method: str, seed: int, args: argparse.Namespace, argv: Sequence[str]) -> dict[str, Any]:
@@ -64,10 +61,10 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
     """
     records = []
     for path in folder.glob("[!.]*_seed*.json"):
-        record = read_json(path, ("method", "seed", "settings", "points"), REMEDY)
+        record = read_json(path, ("method", "seed", "settings", "points"), RETRAIN)
         if record["method"] not in METHODS:
             raise ValueError(
-                f"{path} has the method {record['method']!r}, which must be one of {', '.join(METHODS)}. {REMEDY}"
+                f"{path} has the method {record['method']!r}, which must be one of {', '.join(METHODS)}. {RETRAIN}"
             )
         records.append(record)
     return sorted(records, key=lambda record: (list(METHODS).index(record["method"]), record["seed"]))

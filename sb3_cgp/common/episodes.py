@@ -1,4 +1,4 @@
-"""Ending an episode in a replay buffer whose environment was reset outside of the buffer's sight."""
+"""Ending a replay buffer's last episode, whose environment was reset without a transition being stored."""
 
 import warnings
 

@@ -112,6 +112,7 @@ def sync_folder(folder: Path) -> None:
     Write the names of a folder's files to the disk.
 
     :param folder: the folder
+    :raises OSError: if the disk refuses; not where the file system knows no such operation
     """
     # Windows can open no folders, and need not
     if os.name == "posix":

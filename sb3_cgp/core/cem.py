@@ -80,23 +80,24 @@ class CEM:
         shape = (n_states, self.samples, action_dim)
         # The first Gaussian has mean 0 and standard deviation 1 (the text of Section 3.1 says mean 1, Algorithm 1 says 0)
         samples = th.randn(shape, device=device)
-        elites = self._select_elites(score, samples)
+        elites = take(samples, find_elites(score(samples.tanh()), self.elites))
         for _ in range(self.iterations - 1):
             mean, std = fit_gaussian(elites)
             samples = th.addcmul(mean, std, th.randn(shape, device=device))
-            elites = self._select_elites(score, samples)
+            elites = take(samples, find_elites(score(samples.tanh()), self.elites))
         result = elites[:, 0] if self.result == "best" else elites.mean(dim=1)
         return Selection(actions=result.tanh(), elites=elites)
 
-    def _select_elites(self, score: Score, samples: th.Tensor) -> th.Tensor:
-        """Return the elites of samples before tanh, (B, N, A), best first: (B, K, A)."""
-        winners = find_elites(score(samples.tanh()), self.elites)
-        return samples.gather(1, winners.expand(-1, -1, samples.shape[2]))
-
 
 def find_elites(values: th.Tensor, n_elites: int) -> th.Tensor:
-    """Return the indices of the highest values (B, N), best first, as (B, K, 1). A NaN ranks last."""
-    return values.nan_to_num(nan=-th.inf, posinf=th.inf, neginf=-th.inf).topk(n_elites, dim=1).indices.unsqueeze(2)
+    """Return the indices of the highest values (B, N), best first, as (B, K, 1). A NaN ranks last, even below -inf."""
+    return values.nan_to_num(nan=-th.inf).topk(n_elites, dim=1).indices.unsqueeze(2)  # -inf becomes the lowest float
+
+
+def take(values: th.Tensor, indices: th.Tensor) -> th.Tensor:
+    """Take each state's samples (B, N, A), or values of theirs, by the indices (B, K, 1), as (B, K, A)."""
+    # Two to three times as fast as `torch.take_along_dim`
+    return values.gather(1, indices.expand(-1, -1, values.shape[2]))
 
 
 def fit_gaussian(elites: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -150,7 +150,7 @@ class CGP(OffPolicyAlgorithm):
 
     @property
     def _has_actor(self) -> bool:
-        # From the start where the actor learns with the critics, but not where these have learnt without it
+        # Online there is an actor from the first step, except in a model whose critics have learnt without it before
         learns_along = self._trains_online and self._n_updates <= self.policy_delay
         return self.policy_loss is not None and (self._policy_is_trained or learns_along)
 
@@ -294,6 +294,7 @@ class CGP(OffPolicyAlgorithm):
             callback = self._init_callback(callback)
             callback = with_progress_bar(callback) if progress_bar else callback
             callback.on_training_start(learn_locals(self, callback, max_steps, progress_bar), globals())
+            callback.update_locals(rollout_locals(self, callback))
             for n_steps in range(1, max_steps + 1):
                 # Callbacks may have evaluated the policy. Batch norm of the critics keeps its statistics.
                 self.policy.set_training_mode(True)
@@ -305,11 +306,10 @@ class CGP(OffPolicyAlgorithm):
                 losses.append(loss.detach())
                 if n_steps % self.target_update_interval == 0:
                     update_average(self.actor, self.actor_target, self.tau)
-                callback.update_locals(rollout_locals(self, callback))
                 if is_stopped := not callback.on_step():
                     break
                 if n_steps % offline.ROUND == 0:
-                    self._record_means({"actor_loss": losses})
+                    self._record_round(losses)
                     # The log's axis continues after the environment steps
                     self.logger.dump(self.num_timesteps + n_steps)
                     if plateau.reached(th.stack(losses).mean().item()):
@@ -329,6 +329,10 @@ class CGP(OffPolicyAlgorithm):
         if self.verbose >= 1:
             print(f"The policy was trained for {n_steps} gradient steps")
         return self
+
+    def _record_round(self, losses: list[th.Tensor]) -> None:
+        """Log the mean loss of a round of offline training."""
+        self._record_means({"actor_loss": losses})
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor", "actor_target", "critic", "critic_target", "_actor_lr_schedule"]

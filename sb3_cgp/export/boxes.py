@@ -73,6 +73,7 @@ def is_key(key: Any) -> bool:
     Return whether a key of a Dict space can name an ONNX input.
 
     :param key: the key
+    :return: whether it can
     """
     return isinstance(key, str) and KEY.fullmatch(key) is not None and key != ACTION
 

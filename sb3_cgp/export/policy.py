@@ -43,7 +43,6 @@ class ExportedNetwork(nn.Module):
         self.action_shape = action_space.shape
         self.register_buffer("low", th.as_tensor(action_space.low))
         self.register_buffer("high", th.as_tensor(action_space.high))
-        self.is_normalized = bool(normalizers)
         self.normalizers = nn.ModuleList(normalizers.get(name, nn.Identity()) for name in self.input_names)
 
     def forward(self, *observations: th.Tensor) -> th.Tensor:

@@ -275,7 +275,10 @@ class CudaGraphAlgorithm(CGP):
         return inherited()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in TRANSIENT}
+        # Python has a method of this name since 3.11
+        inherited = getattr(super(), "__getstate__", None)
+        state = vars(self) if inherited is None else inherited()
+        return {name: value for name, value in state.items() if name not in TRANSIENT}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)

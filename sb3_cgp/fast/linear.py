@@ -11,7 +11,7 @@ from torch.nn import functional as F
 # Number of multiplications above which oneDNN is faster despite the cost of its call
 MANY_MULTIPLICATIONS = 2**21
 
-# The rows are few if there are this many times as many outputs
+# Rows are few with at least this many outputs for each
 FEW_ROWS = 4
 
 

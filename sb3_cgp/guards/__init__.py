@@ -1,4 +1,4 @@
-"""Environments that fail, values that are no numbers, and wrong use that would be silent, or blamed on something else."""
+"""Errors for failing environments, for NaN and infinite values, and for wrong use that SB3 ignores or misreports."""
 
 from sb3_cgp.guards.algorithm import GuardedAlgorithm
 

@@ -6,7 +6,6 @@ from sb3_cgp.guards.dummy_vec_env import DummyVecEnvGuard
 from sb3_cgp.guards.episodes import EpisodeGuard
 from sb3_cgp.guards.explanations import ExplanationGuard
 from sb3_cgp.guards.learning_starts import LearningStartsGuard
-from sb3_cgp.guards.losses import LossGuard
 from sb3_cgp.guards.networks import NetworkGuard
 from sb3_cgp.guards.normalisation import NormalisationGuard
 from sb3_cgp.guards.parts import PartsGuard
@@ -33,13 +32,7 @@ class CommonGuards(
     """The guards that populations have too, whose agents have tried their networks one by one, and no ``VecNormalize``."""
 
 
-class GuardedAlgorithm(
-    CommonGuards,
-    NormalisationGuard,
-    NetworkGuard,
-    # Last, so that CGP can list it again after CudaGraphAlgorithm, whose `_descend` has to come first
-    LossGuard,
-):
+class GuardedAlgorithm(CommonGuards, NormalisationGuard, NetworkGuard):
     """
     An algorithm that notices faults of environments and wrong use, and names them or does the right thing.
 

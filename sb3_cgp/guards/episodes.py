@@ -1,7 +1,8 @@
 """Episodes that end unseen: an environment that was reset or stepped elsewhere, or a step that was not stored."""
 
+import copy
 import warnings
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -14,7 +15,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_cgp.common.episodes import end_last_episode
 from sb3_cgp.guards.observations import (
     continues_last_episode,
-    copy_observations,
     count_envs,
     innermost,
     position_of,
@@ -111,7 +111,7 @@ class EpisodeGuard(OffPolicyAlgorithm):
     ) -> None:
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         # The environment may return an array that its next step overwrites
-        self._last_obs = copy_observations(self._last_obs)
+        self._last_obs = copy.deepcopy(self._last_obs)
         position = None if self._own_step is None else self._own_step.position
         self._left_env_at = None if position is None else _EnvMark(self._last_obs, position)
         self._own_step = None
@@ -128,7 +128,7 @@ class EpisodeGuard(OffPolicyAlgorithm):
     def _note_reset(self) -> None:
         """End the replay buffer's last episode after a reset, and remember where the environment is."""
         assert self.env is not None
-        self._last_obs = copy_observations(self._last_obs)
+        self._last_obs = copy.deepcopy(self._last_obs)
         self._left_env_at = _EnvMark(self._last_obs, position_of(self.env))
         self._own_step = None
         if self.replay_buffer is not None:
@@ -185,7 +185,7 @@ class EpisodeGuard(OffPolicyAlgorithm):
         return [*super()._excluded_save_params(), "_left_env_at", "_own_step", "_has_warned_of_moves", "_is_in_rollout"]
 
 
-class _EnvMark:
+class _EnvMark(NamedTuple):
     """
     A moment in an environment's run.
 
@@ -193,19 +193,18 @@ class _EnvMark:
     :param position: the objects that :func:`~sb3_cgp.guards.observations.position_of` returned at the time
     """
 
-    def __init__(self, last_obs: Any, position: tuple[Any, ...]):
-        self.last_obs, self.position = last_obs, position
+    last_obs: Any
+    position: tuple[Any, ...]
 
 
-class _OwnStep:
+class _OwnStep(NamedTuple):
     """
     A step of the training's own.
 
     :param position: the objects that :func:`~sb3_cgp.guards.observations.position_of` returned after it; None until then
     """
 
-    def __init__(self, position: tuple[Any, ...] | None = None):
-        self.position = position
+    position: tuple[Any, ...] | None = None
 
 
 class _StepObserver:

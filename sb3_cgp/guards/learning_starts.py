@@ -10,6 +10,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_cgp.guards.observations import innermost
+
 SelfLearningStartsGuard = TypeVar("SelfLearningStartsGuard", bound="LearningStartsGuard")
 
 
@@ -131,7 +133,7 @@ def _nothing_is_learnt_by(agents: Sequence[int]) -> str:
 
 def _longest_episode(env: VecEnv | None) -> int | None:
     """Return the limit of Gymnasium's ``TimeLimit``; None if an environment lacks it, or is in a process of its own."""
-    base = None if env is None else env.unwrapped
+    base = innermost(env)
     if not isinstance(base, DummyVecEnv) or not all(base.env_is_wrapped(TimeLimit)):
         return None
     limits = [None if each.spec is None else each.spec.max_episode_steps for each in base.envs]

@@ -115,18 +115,6 @@ def count_envs(observations: Any) -> int | None:
     return None if first is None else len(first)
 
 
-def copy_observations(observations: Any) -> Any:
-    """
-    Copy observations.
-
-    :param observations: an array, or arrays by key
-    :return: the copy
-    """
-    if isinstance(observations, dict):
-        return {key: np.copy(value) for key, value in observations.items()}
-    return np.copy(observations)
-
-
 def same_observations(first: Any, second: Any) -> bool:
     """
     Return whether observations are equal.

@@ -1,4 +1,4 @@
-"""Parts of a model that do not fit together: replay buffers and action noise of other environments, a missing buffer."""
+"""Parts of a model that do not fit together: replay buffers and action noise of other environments."""
 
 import copy
 import inspect
@@ -28,11 +28,7 @@ GIVEN_BY_MODEL = {"buffer_size", "observation_space", "action_space", "device", 
 
 
 class PartsGuard(OffPolicyAlgorithm):
-    """
-    An algorithm that adapts its action noise to the number of environments, and refuses a replay buffer that does not fit.
-
-    A model with hindsight replay (HER) can be loaded without an environment, to act.
-    """
+    """An algorithm that adapts action noise to the number of environments, and refuses a replay buffer that does not fit."""
 
     @classmethod
     def _wrap_env(cls, env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -47,14 +43,7 @@ class PartsGuard(OffPolicyAlgorithm):
         require(is_noise, "action_noise", self.action_noise, allowed)
         check_action_noise_shape(self.action_noise, self.action_space)
         check_replay_buffer_kwargs(replay_buffer_class_of(self), self.replay_buffer_kwargs)
-        is_her = isinstance(self.replay_buffer_class, type) and issubclass(self.replay_buffer_class, HerReplayBuffer)
-        if self.env is not None or self.replay_buffer is not None or not is_her:
-            super()._setup_model()
-            return
-        # SB3 demands an environment for a buffer of this class. It makes no buffer if there is one.
-        self.replay_buffer = ReplayBuffer(1, spaces.Discrete(1), self.action_space)
         super()._setup_model()
-        self.replay_buffer = None
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
         allowed = f"an environment: `{type(self).__name__}.load(path, env)`, or `set_env` before `learn`"
@@ -66,11 +55,6 @@ class PartsGuard(OffPolicyAlgorithm):
             check_replay_buffer(self.replay_buffer, self)
             check_contents(self.replay_buffer)
         result = super()._setup_learn(*args, **kwargs)
-        if self.replay_buffer is None:
-            raise ValueError(
-                f"The value of `replay_buffer` is None: a model with {self.replay_buffer_class} that was loaded without an "
-                f"environment can act, and not learn. Load it with one: `{type(self).__name__}.load(path, env)`."
-            )
         self._fit_replay_buffer()
         return result
 

@@ -135,20 +135,11 @@ class BoundsWatch:
 
         :param transition: the transition
         """
-        self.check(transition.observations, transition.timestep)
-
-    def check(self, observation: VecEnvObs, timestep: int) -> None:
-        """
-        Warn if an observation is out of bounds, unless that has happened before.
-
-        :param observation: the observations of all environments, or of one
-        :param timestep: the environment step
-        """
         for key, box in self._boxes.items():
-            values = by_key(observation)[key]
+            values = by_key(transition.observations)[key]
             outside = (values < box.low) | (values > box.high)
             if outside.any():
-                self._warn(key, box, np.asarray(values), outside, timestep)
+                self._warn(key, box, np.asarray(values), outside, transition.timestep)
                 self._boxes = {}
                 return
 

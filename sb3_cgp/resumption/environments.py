@@ -101,28 +101,6 @@ def _state(env: VecEnv | gym.Env) -> tuple[dict[str, Any], list[str]]:
     return state, list(dict.fromkeys(problems))
 
 
-def environment_state(env: VecEnv | gym.Env) -> dict[str, Any] | None:
-    """
-    Copy the state of an environment.
-
-    :param env: the environment, between two steps
-    :return: the first of the two values of :func:`state_and_obstacles`
-    :raises ValueError: if a ``get_training_state()`` returns anything but plain data
-    """
-    return state_and_obstacles(env)[0]
-
-
-def obstacles(env: VecEnv | gym.Env) -> list[str]:
-    """
-    Describe what prevents an environment from being restored, and what would help.
-
-    :param env: the environment, between two steps
-    :return: the second of the two values of :func:`state_and_obstacles`
-    :raises ValueError: if a ``get_training_state()`` returns anything but plain data
-    """
-    return state_and_obstacles(env)[1]
-
-
 def restore_environment(env: VecEnv | gym.Env, state: dict[str, Any]) -> None:
     """
     Restore the state of an environment in another one that was made in the same way.
@@ -132,7 +110,7 @@ def restore_environment(env: VecEnv | gym.Env, state: dict[str, Any]) -> None:
     arguments with which the other environment was made in another way, and which are restored, too.
 
     :param env: the environment to change
-    :param state: the state that :func:`environment_state` returned
+    :param state: the state that :func:`state_and_obstacles` returned
     :raises ValueError: if the state is that of another environment; ``env`` is then not changed
     """
     current, found = _state(env)

@@ -71,7 +71,8 @@ UNSAVED = {
 INFOS = {"buf_infos", "reset_infos"}
 # Of a checker whose last infos are no plain data: its checks of the first two steps, which only warn, are skipped
 CHECKED = {"_previous_data": None, "checked_step": True, "checked_data_reuse": True}
-# Of an obstacle to saving a state, which is none to restoring one: that it was saved shows that nothing shared memory then
+# Words of an obstacle to saving a state, by which `restore_environment` knows it: restoring is safe, as nothing shared memory
+# when the state was saved
 SHARES = "shares memory with"
 RANDOM_STATE = {"_np_random", "_np_random_seed"}
 # They do not change their MuJoCo models; environments of others may

@@ -27,6 +27,7 @@ def is_restorable(data: Any) -> bool:
     Return whether the numeric fields of MuJoCo's data are its whole state, as without plugins, flexible bodies and sleep.
 
     :param data: MuJoCo's data
+    :return: whether they are
     """
     import mujoco
 
@@ -42,6 +43,7 @@ def is_view(array: np.ndarray, data: Any) -> bool:
 
     :param array: the array
     :param data: MuJoCo's data
+    :return: whether it does
     """
     offset = array.__array_interface__["data"][0] - data.qpos.__array_interface__["data"][0]
     return 0 <= offset < data.nbuffer

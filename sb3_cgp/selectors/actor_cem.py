@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import torch as th
 
-from sb3_cgp.core.cem import CEM, Score, Selection, find_elites, fit_gaussian
-from sb3_cgp.selectors.proposals import ActorStart, check_start, take
+from sb3_cgp.core.cem import CEM, Score, Selection, find_elites, fit_gaussian, take
+from sb3_cgp.selectors.proposals import ActorStart, check_start
 
 
 @dataclass
@@ -64,7 +64,7 @@ class ActorCEM(CEM):
         if proposals is None:
             return super().select(score, n_states, action_dim, device)
         shape = (n_states, self.samples, action_dim)
-        samples, actions = self.start.move(th.randn(shape, device=device), proposals)
+        samples, actions = self.start.first_samples(th.randn(shape, device=device), proposals)
         elites, elite_actions = self._keep_elites(score, samples, actions)
         for _ in range(self.iterations - 1):
             mean, std = fit_gaussian(elites)

@@ -10,8 +10,8 @@ import torch as th
 
 from sb3_cgp.common.rules import require, require_number
 from sb3_cgp.core.arguments import check_cem
-from sb3_cgp.core.cem import Score, Selection, find_elites
-from sb3_cgp.selectors.proposals import ActorStart, take
+from sb3_cgp.core.cem import Score, Selection, find_elites, take
+from sb3_cgp.selectors.proposals import ActorStart
 
 
 @dataclass
@@ -73,7 +73,7 @@ class MPPI:
         if self.start is None or proposals is None:
             actions = samples.tanh()
         else:
-            samples, actions = self.start.move(samples, proposals)
+            samples, actions = self.start.first_samples(samples, proposals)
         winners, weights = self._weigh_elites(score(actions))
         for _ in range(self.iterations - 1):
             mean, std = fit_weighted_gaussian(take(samples, winners), weights)

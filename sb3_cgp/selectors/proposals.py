@@ -78,7 +78,7 @@ class ActorStart:
         """
         return n_samples > 1 and (self.std > 0 or self.n_around(n_samples) < n_samples - 1)
 
-    def move(self, samples: th.Tensor, proposals: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def first_samples(self, samples: th.Tensor, proposals: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         Make first samples from standard normal ones.
 
@@ -126,17 +126,6 @@ def before_tanh(actions: th.Tensor) -> th.Tensor:
     :return: the values, of the same shape
     """
     return actions.clamp(-SATURATION, SATURATION).atanh()
-
-
-def take(values: th.Tensor, indices: th.Tensor) -> th.Tensor:
-    """
-    Take samples of each state by their indices.
-
-    :param values: the samples, or something of each of them, (B, N, A)
-    :param indices: indices of samples, (B, K, 1)
-    :return: the chosen ones, (B, K, A)
-    """
-    return values.gather(1, indices.expand(-1, -1, values.shape[2]))
 
 
 def check_start(fraction: float, std: float, prefix: str = "") -> None:
