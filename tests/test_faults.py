@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvW
 from trainings import Do
 
 from sb3_cgp import CGP
-from sb3_cgp.guards.transitions import BoundsWatch
+from sb3_cgp.guards.transitions import BoundsWatch, Transition
 from sb3_cgp.resumption import RestorableEnv
 from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
 from sb3_cgp.resumption.store import StateStore
@@ -317,9 +317,18 @@ def test_the_bounds_of_each_part_of_an_observation_are_watched():
     parts = {"position": spaces.Box(-1, 1, (2,)), "image": spaces.Box(0, 255, (2, 2), np.uint8), "free": UNBOUNDED}
     watch = BoundsWatch(spaces.Dict(parts))
     inside = {"position": np.ones((1, 2)), "image": np.zeros((1, 2, 2)), "free": np.full((1, 1), 1e9)}
-    watch.check(inside, 3)
+    watch(Transition(3, spaces.Dict(parts), inside, None, [], 1))
     with pytest.warns(UserWarning, match=r"an observation `position` .* step 4: value 2.0 at index \(1,\)"):
-        watch.check({**inside, "position": np.array([[0.0, 2.0]])}, 4)
+        watch(Transition(4, spaces.Dict(parts), {**inside, "position": np.array([[0.0, 2.0]])}, None, [], 1))
+
+
+def test_bounds_are_compared_in_the_data_type_of_the_space():
+    box = spaces.Box(-0.7, 0.7, (1,), np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        BoundsWatch(box)(Transition(3, box, np.array([[0.7]]), None, [], 1))
+    with pytest.warns(UserWarning, match="outside of its observation space"):
+        BoundsWatch(box)(Transition(3, box, np.array([[0.71]]), None, [], 1))
 
 
 def learn(folder, fault=None, at=73, model=None, function=None):

@@ -182,7 +182,9 @@ def test_callbacks_that_sb3_takes_are_taken():
     """Also one that holds the class of another for a use of its own."""
     keeper = ConvertCallback(lambda *_: True)
     keeper.kind = CheckpointCallback
-    for callback in (None, [], lambda local, globals_: True, keeper, *in_slots(keeper)):
+    evaluation = EvalCallback(make_model().get_env(), eval_freq=100)
+    evaluation.callbacks = [print]
+    for callback in (None, [], lambda local, globals_: True, keeper, evaluation, *in_slots(keeper)):
         assert make_model().learn(8, callback=callback).num_timesteps == 8
 
 

@@ -5,7 +5,7 @@ import pytest
 from guarded import located
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
-from sb3_cgp.common.episodes import end_last_episode
+from sb3_cgp.common.replay_buffers import end_last_episode
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer
 from sb3_cgp.guards.observations import continues_last_episode
 

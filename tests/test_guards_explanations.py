@@ -140,6 +140,18 @@ class Unpacking(gym.Wrapper):
         return self.env.step(first)
 
 
+class OldWrapper(gym.Wrapper):
+    def step(self, action):
+        observation, reward, done, info = self.env.step(action)
+        return observation, reward, done, info
+
+
+@pytest.mark.parametrize("wrap", [bare, monitored, wrapped])
+def test_a_wrapper_of_the_old_api_is_told_what_an_environment_returns(wrap):
+    with pytest.raises(ValueError, match=r"The environment's `step` must return five values"):
+        GuardedTD3("MlpPolicy", wrap(OldWrapper(Located())), **SMALL).learn(20)
+
+
 class UnpackingFive(gym.Wrapper):
     def reset(self, *, seed=None, options=None):
         first, *_, _, _, _, _ = np.zeros(3)

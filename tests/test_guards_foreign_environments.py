@@ -1,11 +1,16 @@
 """Vectorised environments of other packages: arrays that they overwrite, and what they lack."""
 
+import copy
+import pickle
+from collections import ChainMap, OrderedDict, UserDict
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from guarded import IGNORED_WARNINGS, SMALL, GuardedTD3, Located, assert_no_episode_runs_into_another, located, make_model
 from stable_baselines3 import TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor, VecNormalize
+from trainings import Do
 
 pytestmark = IGNORED_WARNINGS
 
@@ -79,6 +84,64 @@ def test_environments_that_a_method_of_another_kind_would_break_are_trained_on(m
     assert "reset" not in vars(model.env.envs[0].unwrapped)
     model.learn(30)
     assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)
+
+
+def copy_attributes(env):
+    return copy.deepcopy(vars(env))
+
+
+def copy_with_pickle(env):
+    return pickle.loads(pickle.dumps(vars(env)))
+
+
+@pytest.mark.parametrize("snapshot", [copy_attributes, copy_with_pickle])
+def test_an_environment_may_go_back_to_a_copy_of_its_attributes(snapshot):
+    class LookingAhead(Located):
+        def step(self, action):
+            before = snapshot(self)
+            super().step(action)
+            vars(self).update(before)
+            return super().step(action)
+
+    model = make_model("n-step", env=DummyVecEnv([LookingAhead])).learn(30)
+    assert model.env.envs[0].steps == 30 % 7
+    assert model.replay_buffer.dones.sum() == 30 // 7
+    assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)
+
+
+def test_the_environments_are_in_their_list_during_a_training_and_after_it():
+    def replace():
+        assert isinstance(model.env.envs, list)
+        assert model.env.envs[0] is model.get_env().get_attr("unwrapped")[0] is first
+        assert type(copy.deepcopy(model.env).envs) is type(pickle.loads(pickle.dumps(model.env.envs))) is list
+        model.env.envs[0] = second
+
+    first, second = Located(), Located(length=3)
+    second.reset()
+    model = make_model("plain", env=DummyVecEnv([lambda: first]))
+    envs = model.env.envs
+    model.learn(20, Do(7, replace))
+    assert model.env.envs is envs
+    assert envs == [second]
+    assert second.steps == 13 % 3
+
+
+class WithParts(Located):
+    """Observes mappings that are no dictionaries."""
+
+    def __init__(self, kind):
+        super().__init__(goals=True)
+        self.kind = kind
+
+    def observe(self):
+        return self.kind(super().observe())
+
+
+@pytest.mark.parametrize("kind", [dict, OrderedDict, UserDict, ChainMap])
+@pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor])
+def test_observations_may_be_any_mapping(wrap, kind):
+    model = GuardedTD3("MultiInputPolicy", wrap(DummyVecEnv([lambda: WithParts(kind)])), **SMALL).learn(20)
+    assert model._n_updates == 14
 
 
 class Commenting(Located):

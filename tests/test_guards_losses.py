@@ -19,7 +19,7 @@ class Descending(TD3):
     def train(self, gradient_steps, batch_size=100):
         for loss in self.losses:
             self._n_updates += 1
-            self._descend("critic", th.tensor(loss))
+            self._descend("critic", th.tensor(loss, requires_grad=True))
 
 
 class Guarded(LossGuard, Descending):

@@ -1,5 +1,7 @@
 """An environment that a callback, another training or an evaluation moves during a training."""
 
+import warnings
+
 import numpy as np
 import pytest
 from guarded import IGNORED_WARNINGS, SMALL, GuardedTD3, Located, assert_no_episode_runs_into_another, located, make_model
@@ -107,6 +109,27 @@ def test_an_environment_that_a_callback_sets_within_a_step_is_refused():
     model.learn(20, reset_num_timesteps=False)
     assert np.isfinite(model.replay_buffer.observations).all()
     assert_no_episode_runs_into_another(model.replay_buffer)
+
+
+@pytest.mark.parametrize("vec_env", [DummyVecEnv, lambda fns: SubprocVecEnv(fns, start_method="fork")])
+def test_an_environment_that_a_callback_sets_between_rollouts_begins_an_episode(vec_env):
+    class Setting(BaseCallback):
+        def _on_rollout_end(self):
+            if self.num_timesteps == 12:
+                self.model.set_env(other)
+
+        def _on_step(self):
+            return True
+
+    first, other = vec_env([Located]), vec_env([Located])
+    model = make_model("n-step", env=first)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*outside of this training")
+        model.learn(30, Setting())
+    assert model.replay_buffer.dones[:12].nonzero()[0].tolist() == [6, 11]
+    assert_no_episode_runs_into_another(model.replay_buffer, n_steps=3)
+    first.close()
+    other.close()
 
 
 class Overflowing(Located):

@@ -1,5 +1,6 @@
 """Errors that the first gradient step would raise are raised when a model is made, and nothing else changes."""
 
+import copy
 import random
 import re
 
@@ -105,6 +106,20 @@ def test_networks_that_are_frozen_on_purpose_are_taken(frozen, arguments, tmp_pa
     model.save(tmp_path / "model")
     loaded = CGP.load(tmp_path / "model")
     assert not any(parameter.requires_grad for parameter in getattr(loaded, frozen).parameters())
+
+
+@pytest.mark.parametrize("arguments", [{}, dict(policy_loss="qgp"), dict(cem_start="actor")])
+def test_an_actor_that_is_frozen_stays_and_the_critics_learn(arguments):
+    """As with SB3's TD3: for critics that are trained first under a policy from elsewhere."""
+    model = CGP("MlpPolicy", located(), **(SMALL | arguments))
+    model.actor.requires_grad_(False)
+    before = copy.deepcopy(model.policy.state_dict())
+    model.learn(20)
+    changed = {name for name, value in model.policy.state_dict().items() if not th.allclose(value, before[name], atol=1e-6)}
+    assert {name.partition(".")[0] for name in changed} == {"critic", "critic_target"}
+    model.actor.requires_grad_(True)
+    model.learn(20, reset_num_timesteps=False)
+    assert not th.equal(model.actor.mu[2].bias, before["actor.mu.2.bias"])
 
 
 @pytest.mark.parametrize("extractor", [Extractor, Caching])

@@ -163,6 +163,23 @@ def test_the_order_that_the_message_names_works(make_env, policy):
     GuardedTD3(policy, make_env(), **(SMALL | dict(buffer_size=20, batch_size=2))).learn(9)
 
 
+class Bounded(VecEnvWrapper):
+    """Has other bounds than what it wraps."""
+
+    def __init__(self, venv):
+        super().__init__(venv, spaces.Box(-20, 20, venv.observation_space.shape))
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+
+def test_a_wrapper_that_changes_bounds_alone_may_lie_outside():
+    assert make_model(Bounded(VecNormalize(located()))).learn(20)._n_updates == 14
+
+
 def test_a_wrapper_that_changes_values_after_normalisation_is_noticed():
     model = make_model(Negated(VecNormalize(DummyVecEnv([Located]))))
     with pytest.raises(ValueError, match="not those that VecNormalize returned"):

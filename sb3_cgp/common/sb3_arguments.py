@@ -132,7 +132,8 @@ def check_off_policy_arguments(model: OffPolicyAlgorithm) -> None:
     # Where SB3 chooses the replay buffer, it asserts this
     has_dict = isinstance(model.observation_space, spaces.Dict)
     allowed = "1 with a Dict observation space, for which SB3 has no n-step replay buffer"
-    require(model.n_steps == 1 or not has_dict, "n_steps", model.n_steps, allowed)
+    is_chosen = model.replay_buffer_class is None
+    require(model.n_steps == 1 or not has_dict or not is_chosen, "n_steps", model.n_steps, allowed)
     # SB3's buffers refuse these too, one of them at the first gradient step only
     has_no_such_mode = issubclass(replay_buffer_class_of(model), DictReplayBuffer | NStepReplayBuffer)
     is_supported = not model.optimize_memory_usage or not has_no_such_mode

@@ -46,6 +46,21 @@ def by_key(whole: Any) -> dict[Any, Any]:
     return parts if isinstance(parts, dict) else {None: parts}
 
 
+def have_same_layout(space: spaces.Space[Any], other: spaces.Space[Any]) -> bool:
+    """
+    Return whether values of two spaces have the same keys and shapes, and are both integers or both floats.
+
+    :param space: a space
+    :param other: another space
+    :return: whether they have, whatever their bounds; whether the spaces are equal where they are of other kinds
+    """
+    if isinstance(space, spaces.Dict) and isinstance(other, spaces.Dict):
+        return space.keys() == other.keys() and all(have_same_layout(space[key], other[key]) for key in space)
+    if isinstance(space, spaces.Box) and isinstance(other, spaces.Box):
+        return space.shape == other.shape and np.dtype(space.dtype).kind == np.dtype(other.dtype).kind
+    return space == other
+
+
 def sample_of(space: spaces.Space[Any]) -> Any:
     """
     Draw a random observation, also from a float64 ``Box`` whose bounds are so wide that Gymnasium's ``sample`` overflows.

@@ -219,8 +219,9 @@ class CudaGraphAlgorithm(CGP):
             super()._descend(name, loss)
             return
         skip_step_if(optimizer, self._loss_watch.see(name, loss))
-        # The core's own: a guard in between would read the loss on the host
-        CGP._descend(self, name, loss)
+        if loss.requires_grad:
+            # The core's own: a guard in between would read the loss on the host
+            CGP._descend(self, name, loss)
 
     def _record_means(self, values: dict[str, list[th.Tensor]]) -> None:
         if self._step_losses is not None:

@@ -9,17 +9,16 @@ from typing import Any, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_cgp.common.replay_buffers import is_ours
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer, fits_device, leaves_room
-
-SB3_BUFFERS = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer)
 
 SelfLeanReplayAlgorithm = TypeVar("SelfLeanReplayAlgorithm", bound="LeanReplayAlgorithm")
 
@@ -57,6 +56,8 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
     cuda_graphs: bool = True
     # Set by `load`, before the model is built
     _defers_replay_buffer: bool = False
+    # The space of stored observations for which a buffer was allocated last
+    _allocated_for: spaces.Space | None = None
 
     def _setup_model(self) -> None:
         # SB3 stores its choices in the arguments, where they would outrank the arguments of a later `load`
@@ -95,9 +96,10 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
             kwargs["env"] = self.env
         if self._chooses_n_step_returns(buffer_class):
             kwargs |= {"n_steps": self.n_steps, "gamma": self.gamma}
+        self._allocated_for = self._stored_space()
         return buffer_class(
             self.buffer_size,
-            self._stored_space(),
+            self._allocated_for,
             self.action_space,
             device=self.device,
             n_envs=self.n_envs,
@@ -120,11 +122,12 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         return self.replay_buffer_class is None and issubclass(buffer_class, NStepReplayBuffer)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
-        if self.replay_buffer is not None and self.replay_buffer.observation_space != self._stored_space():
-            # `set_env` has added or removed VecNormalize
-            if self.replay_buffer.size() == 0:
+        buffer, space = self.replay_buffer, self._stored_space()
+        # `set_env` may have added or removed VecNormalize since
+        if buffer is not None and is_ours(type(buffer)) and buffer.observation_space != space:
+            if buffer.size() == 0 and buffer.observation_space == self._allocated_for:
                 self.replay_buffer = None
-            elif self._is_normalized:
+            elif buffer.size() > 0 and self._is_normalized:
                 message = "The replay buffer has observations in float32, and `env` normalises them now: those near their"
                 warnings.warn(
                     f"{message} mean may have lost their differences. Train a new model to keep these.", stacklevel=2
@@ -160,11 +163,11 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         asked = replay_buffer_class_of(self)
         kinds = [ReplayBuffer if each is DeviceReplayBuffer else each for each in (type(buffer), asked)]
         # A class of the user's own may do what the arguments ask for
-        fits = kinds[0] is kinds[1] or not set(kinds) <= set(SB3_BUFFERS)
+        fits = kinds[0] is kinds[1] or not all(map(is_ours, kinds))
         allowed = f"a {asked.__name__}, by the model's `replay_buffer_class`, `n_steps` and observation space"
         require(fits, "replay_buffer", type(buffer).__name__, f"{allowed}: load the model with those of the saved one")
         # A class of the user's own may change its arguments along the training
-        kwargs = self.replay_buffer_kwargs if kinds[0] in SB3_BUFFERS else {}
+        kwargs = self.replay_buffer_kwargs if is_ours(kinds[0]) else {}
         for name, value in {"optimize_memory_usage": self.optimize_memory_usage, **kwargs}.items():
             stored = getattr(buffer, name, value)
             value = KEY_TO_GOAL_STRATEGY.get(value.lower(), value) if isinstance(value, str) else value
@@ -202,4 +205,4 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_defers_replay_buffer"]
+        return [*super()._excluded_save_params(), "_defers_replay_buffer", "_allocated_for"]

@@ -8,7 +8,7 @@ from numbers import Real
 from typing import Any, TypeVar
 
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EventCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
@@ -19,8 +19,8 @@ from sb3_cgp.guards.construction import check_constructor_arguments
 
 SelfArgumentGuard = TypeVar("SelfArgumentGuard", bound="ArgumentGuard")
 
-# The attributes in which SB3's CallbackList and EventCallback hold other callbacks
-SLOTS = ("callbacks", "callback", "callback_on_new_best")
+# The attributes in which SB3's classes hold other callbacks
+SLOTS = {CallbackList: "callbacks", EventCallback: "callback", EvalCallback: "callback_on_new_best"}
 # Arguments that populations of agents have, and no other algorithm has
 POPULATION_ARGUMENTS = {"agents", "overlap"}
 # What to do about errors of `load`, by their beginnings
@@ -154,7 +154,7 @@ def check_callback(name: str, value: Any) -> None:
 def _check_parts(name: str, value: Any) -> None:
     """Check the callbacks within a callback or a list."""
     # Not any attribute: that of a user's own callback may hold a class for a purpose of its own
-    slots = SLOTS if isinstance(value, CallbackList | EventCallback) else ()
+    slots = [slot for kind, slot in SLOTS.items() if isinstance(value, kind)]
     parts = {name: value} if isinstance(value, list) else {f"{name}.{slot}": vars(value).get(slot) for slot in slots}
     for place, content in parts.items():
         named = {f"{place}[{i}]": each for i, each in enumerate(content)} if isinstance(content, list) else {place: content}

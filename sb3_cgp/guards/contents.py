@@ -8,6 +8,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
+from sb3_cgp.common.replay_buffers import is_ours
 from sb3_cgp.common.spaces import by_key
 
 # Rows that are checked at a time, for the memory that the check takes
@@ -17,7 +18,7 @@ SCALED = "scaled to [-1, 1]: add `model.policy.scale_action(action)`, of actions
 
 def check_contents(buffer: ReplayBuffer) -> None:
     """
-    Check that the numbers in a replay buffer are finite, and actions scaled.
+    Check that the numbers in a replay buffer are finite, and actions scaled, unless a user's own class stores others.
 
     :param buffer: the replay buffer
     :raises ValueError: naming the array, the first row that breaks the rule, and the remedy
@@ -27,14 +28,14 @@ def check_contents(buffer: ReplayBuffer) -> None:
         is_float = array.is_floating_point() if isinstance(array, th.Tensor) else array.dtype.kind == "f"
         if not is_float:
             continue
-        is_actions = name == "actions" and isinstance(buffer.action_space, spaces.Box)
+        is_scaled = name == "actions" and isinstance(buffer.action_space, spaces.Box) and is_ours(type(buffer))
         for first in range(0, size, ROWS):
             rows: Any = array[first : min(first + ROWS, size)]
             # A comparison with NaN is false
-            is_wrong = ~(abs(rows) <= 1.0 + 1e-6) if is_actions else ~(abs(rows) < np.inf)
+            is_wrong = ~(abs(rows) <= 1.0 + 1e-6) if is_scaled else ~(abs(rows) < np.inf)
             if is_wrong.any():
                 row = int(th.as_tensor(is_wrong).nonzero()[0][0])
-                allowed = SCALED if is_actions else "finite: leave out the transition"
+                allowed = SCALED if is_scaled else "finite: leave out the transition"
                 value = rows[is_wrong][0]
                 raise ValueError(f"The value in `replay_buffer.{name}[{first + row}]` is {value}, but must be {allowed}.")
 

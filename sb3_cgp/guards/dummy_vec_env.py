@@ -1,11 +1,10 @@
 """Observations that a ``DummyVecEnv`` would change before anything else sees them."""
 
 import copy
-import functools
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from typing import Any, TypeVar
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, SupportsIndex, TypeVar
 
 import gymnasium as gym
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -38,12 +37,9 @@ class DummyVecEnvGuard(OffPolicyAlgorithm):
         env = innermost(self.env)
         if not isinstance(env, DummyVecEnv):
             return super().learn(*args, **kwargs)
-        with ExitStack() as stack:
-            # A private method, as nothing outside of the environment sees an observation before it is collected
-            observer = _ObservationObserver(env, self, is_clipped=_sees_raw(self.get_vec_normalize_env()))
-            stack.enter_context(_shadowed(env, "_save_obs", observer.save))
-            for index, each in enumerate(env.envs):
-                stack.enter_context(_shadowed(each, "reset", functools.partial(observer.reset, index, each.reset)))
+        # A private method, as nothing outside of the environment sees an observation before it is collected
+        observer = _ObservationObserver(env, self, is_clipped=_sees_raw(self.get_vec_normalize_env()))
+        with _shadowed(env, "_save_obs", observer.save), _observed(env, observer):
             return super().learn(*args, **kwargs)
 
 
@@ -59,6 +55,11 @@ class _ObservationObserver:
     def __init__(self, env: DummyVecEnv, model: OffPolicyAlgorithm, is_clipped: bool):
         self._env, self._is_clipped = env, is_clipped
         self._model: weakref.ref[OffPolicyAlgorithm] | None = weakref.ref(model)
+        # The final observations that have been seen. Of those of before, copies: the environment may use its array again.
+        self._seen = [copy.deepcopy(info.get("terminal_observation")) for info in env.buf_infos]
+        for info, seen in zip(env.buf_infos, self._seen, strict=True):
+            if seen is not None:
+                info["terminal_observation"] = seen
 
     def save(self, env_idx: int, obs: Any) -> None:
         """
@@ -74,35 +75,67 @@ class _ObservationObserver:
             check_shape("observation", obs, self._env.observation_space, None, model.num_timesteps)
         type(self._env)._save_obs(self._env, env_idx, obs)
 
-    def reset(self, env_idx: int, reset: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    def save_final(self, env_idx: int) -> None:
         """
-        Reset one of the environments, after checking and copying its episode's final observation, which it may overwrite.
+        Check and copy the final observation of an episode that has just ended, before ``reset`` may overwrite it.
 
         ``VecNormalize`` would broadcast and clip that observation before any other check.
 
         :param env_idx: the environment's index
-        :param reset: its own method
-        :param args: the arguments of that
-        :param kwargs: the same by keyword
-        :return: what that returns
         :raises ValueError: if the final observation is of a wrong shape, NaN or infinite
         """
         info = self._env.buf_infos[env_idx]
-        # Taken out, so that the next reset does not find one that is refused
-        final = info.pop("terminal_observation", None)
-        if final is not None:
-            model = None if self._model is None else self._model()
-            if model is not None:
-                space, timestep = self._env.observation_space, model.num_timesteps + self._env.num_envs
-                if self._is_clipped:
-                    check_final_observation(final, space, timestep)
-                else:
-                    check_shape("terminal observation", final, space, None, timestep)
-            info["terminal_observation"] = copy.deepcopy(final)
-        return reset(*args, **kwargs)
+        final = info.get("terminal_observation")
+        model = None if self._model is None else self._model()
+        if final is None or final is self._seen[env_idx] or model is None:
+            return
+        space, timestep = self._env.observation_space, model.num_timesteps + self._env.num_envs
+        self._seen[env_idx] = final
+        if self._is_clipped:
+            check_final_observation(final, space, timestep)
+        else:
+            check_shape("terminal observation", final, space, None, timestep)
+        self._seen[env_idx] = info["terminal_observation"] = copy.deepcopy(final)
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"_model": None}
+
+
+class _ObservedEnvironments(list[gym.Env]):
+    """
+    The environments of a ``DummyVecEnv``, which takes each from this list to reset it, once its final observation is known.
+
+    A method in the place of an environment's own ``reset`` would be copied with the environment's attributes. A copy of this
+    list is a plain one.
+
+    :param envs: the environments
+    :param observer: is told of each access
+    """
+
+    def __init__(self, envs: list[gym.Env], observer: _ObservationObserver):
+        super().__init__(envs)
+        self._observer = observer
+
+    def __getitem__(self, index: Any) -> Any:
+        if not isinstance(index, slice):
+            self._observer.save_final(index)
+        return super().__getitem__(index)
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
+        return list, (list(self),)
+
+
+@contextmanager
+def _observed(env: DummyVecEnv, observer: _ObservationObserver) -> Iterator[None]:
+    """Let an observer see the final observations of a ``DummyVecEnv`` for a time."""
+    envs = env.envs
+    env.envs = _ObservedEnvironments(envs, observer)
+    try:
+        yield
+    finally:
+        # A callback may have replaced some
+        envs[:] = env.envs
+        env.envs = envs
 
 
 def _sees_raw(normalizer: VecNormalize | None) -> bool:
@@ -114,9 +147,8 @@ def _sees_raw(normalizer: VecNormalize | None) -> bool:
 
 
 @contextmanager
-def _shadowed(owner: DummyVecEnv | gym.Env, name: str, method: Any) -> Iterator[None]:
+def _shadowed(owner: DummyVecEnv, name: str, method: Any) -> Iterator[None]:
     """Put a method in the place of an object's own for a time, in which a nested training may do the same."""
-    # Not by `setattr`, which a wrapper may forward to what it wraps
     attributes = vars(owner)
     before = attributes.get(name)
     attributes[name] = method

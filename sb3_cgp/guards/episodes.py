@@ -12,7 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_cgp.common.episodes import end_last_episode
+from sb3_cgp.common.replay_buffers import end_last_episode
 from sb3_cgp.guards.observations import (
     continues_last_episode,
     count_envs,
@@ -93,7 +93,11 @@ class EpisodeGuard(OffPolicyAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        if self._env_has_moved() or (self._left_env_at is None and self._env_differs()):
+        if self._last_obs is None:
+            # A callback has set another environment between two rollouts
+            self._begin_episode(action_noise)
+        elif self._env_has_moved() or (self._left_env_at is None and self._env_differs()):
+            self._warn_of_move()
             self._begin_episode(action_noise)
         actions = super()._sample_action(learning_starts, action_noise, n_envs)
         # From here on the environment may be anywhere if an exception ends the step
@@ -134,8 +138,7 @@ class EpisodeGuard(OffPolicyAlgorithm):
         if self.replay_buffer is not None:
             end_last_episode(self.replay_buffer)
 
-    def _begin_episode(self, action_noise: ActionNoise | None) -> None:
-        """Reset an environment that was reset or stepped by others during the training."""
+    def _warn_of_move(self) -> None:
         if not self._has_warned_of_moves:
             self._has_warned_of_moves = True
             warnings.warn(
@@ -144,6 +147,9 @@ class EpisodeGuard(OffPolicyAlgorithm):
                 "environment of its own, to keep episodes whole. This is said once in a training.",
                 stacklevel=2,
             )
+
+    def _begin_episode(self, action_noise: ActionNoise | None) -> None:
+        """Reset the environment during the training."""
         assert self.env is not None
         self._last_obs = self.env.reset()  # type: ignore[assignment]
         self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)

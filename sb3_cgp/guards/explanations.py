@@ -28,7 +28,7 @@ OLD_STEP = (
     f"means that the episode ran out of time. {OLD_API}"
 )
 # The call of an environment, of one of several, of a wrapper's base class, or of a method that replaces another
-CALL = re.compile(r"(?:(?:env\w*|super\(\)|self)(?:\[[^]]*\])?\.|return )(step|reset)\(")
+CALL = re.compile(r"(?:\b(?:env\w*|super\(\)|self)(?:\[[^]]*\])?\.|return )(step|reset)\(")
 OLD_VEC_STEP = (
     "The vectorised environment's `step_wait` must return four values, `observations, rewards, dones, infos`, as SB3's do: "
     "`dones` are ends of any kind, and the info of an episode that ran out of time has `TimeLimit.truncated` True."
@@ -97,8 +97,10 @@ def explain(error: Exception, model: OffPolicyAlgorithm) -> str | None:
         return _explain_no_episode(frame.f_locals["self"], model)
     # Not an error of the environment's own code, but of its callers: SB3, Gymnasium, this package, and wrappers of any package
     is_caller = frame.f_globals.get("__name__", "").startswith(("stable_baselines3.", "gymnasium.", "sb3_cgp.guards."))
-    if is_caller or isinstance(frame.f_locals.get("self"), gym.Wrapper):
-        return _explain_old_api(str(error), linecache.getline(frame.f_code.co_filename, line_number, frame.f_globals))
+    is_wrapper = isinstance(frame.f_locals.get("self"), gym.Wrapper)
+    if is_caller or is_wrapper:
+        line = linecache.getline(frame.f_code.co_filename, line_number, frame.f_globals)
+        return _explain_old_api(str(error), line, is_wrapper)
     return None
 
 
@@ -111,10 +113,11 @@ def _explain_reward(error: Exception, frame: FrameType) -> str | None:
     return None
 
 
-def _explain_old_api(error: str, line: str) -> str | None:
+def _explain_old_api(error: str, line: str, is_wrapper: bool) -> str | None:
     """Explain an error of unpacking what the environment returned, or of calling it, in a line of code."""
     called = CALL.search(line)
-    if called is not None and "values to unpack (expected 4" in error:
+    # A wrapper that expects four values has the old API itself
+    if called is not None and "values to unpack (expected 4" in error and not is_wrapper:
         return OLD_VEC_STEP
     if called is not None and ("values to unpack" in error or "cannot unpack" in error):
         return OLD_STEP if called[1] == "step" else OLD_RESET

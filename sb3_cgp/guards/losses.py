@@ -1,4 +1,4 @@
-"""Losses that are NaN or infinite."""
+"""Losses that are NaN or infinite, or that nothing is trained by."""
 
 import math
 
@@ -7,7 +7,11 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 
 class LossGuard(OffPolicyAlgorithm):
-    """An algorithm, with a method ``_descend``, that takes no optimizer step down a loss that is NaN or infinite."""
+    """
+    An algorithm, with a method ``_descend``, that takes no optimizer step down a loss that is NaN or infinite.
+
+    Nor does it down a loss that depends on frozen networks alone, which have no gradient.
+    """
 
     def _descend(self, name: str, loss: th.Tensor) -> None:
         """
@@ -23,4 +27,6 @@ class LossGuard(OffPolicyAlgorithm):
                 f"The {name} loss is {value} at gradient step {self._n_updates}, environment step {self.num_timesteps}. "
                 f"The {name} is as before that step."
             )
-        super()._descend(name, loss)  # type: ignore[misc]  # of the algorithm that this class is mixed into
+        # Not where the user has frozen the network, as by `requires_grad_(False)`
+        if loss.requires_grad:
+            super()._descend(name, loss)  # type: ignore[misc]  # of the algorithm that this class is mixed into

@@ -8,7 +8,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, VecTransposeImage, unwrap_vec_normalize
 
-from sb3_cgp.common.spaces import by_key
+from sb3_cgp.common.spaces import by_key, have_same_layout
 from sb3_cgp.common.statistics import WITH_STATISTICS, count_observations
 
 
@@ -119,7 +119,7 @@ def check_wrappers(env: VecEnv) -> None:
     while normalizer is not None and env is not normalizer:
         assert isinstance(env, VecEnvWrapper)
         transposes = isinstance(env, VecTransposeImage) and not env.skip
-        if transposes or env.observation_space != env.venv.observation_space:
+        if transposes or not have_same_layout(env.observation_space, env.venv.observation_space):
             name = type(env).__name__
             inside = normalizer.observation_space
             hint = (

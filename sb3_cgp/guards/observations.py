@@ -10,7 +10,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 
-from sb3_cgp.common.episodes import stores_rows
+from sb3_cgp.common.replay_buffers import saves_memory, stores_rows
 from sb3_cgp.common.spaces import by_key
 
 
@@ -90,13 +90,12 @@ def continues_last_episode(buffer: ReplayBuffer, observations: Any) -> bool:
     if buffer.size() == 0 or not stores_rows(buffer) or buffer.n_envs != count_envs(observations):
         return False
     goes_on = _array(buffer.dones[buffer.pos - 1]) == 0
-    stored, row = (
-        (buffer.observations, buffer.pos) if buffer.optimize_memory_usage else (buffer.next_observations, buffer.pos - 1)
-    )
-    pairs = [(_array(each[row]), _array(by_key(observations)[key])) for key, each in by_key(stored).items()]
-    return all(
-        np.array_equal(last[goes_on], new.reshape(last.shape).astype(last.dtype)[goes_on], equal_nan=True)
-        for last, new in pairs
+    stored, row = (buffer.observations, buffer.pos) if saves_memory(buffer) else (buffer.next_observations, buffer.pos - 1)
+    shown, last = by_key(observations), {key: _array(each[row]) for key, each in by_key(stored).items()}
+    # A user's own class may store something else of them
+    return all(key in shown and np.size(shown[key]) == each.size for key, each in last.items()) and all(
+        np.array_equal(each[goes_on], _array(shown[key]).reshape(each.shape).astype(each.dtype)[goes_on], equal_nan=True)
+        for key, each in last.items()
     )
 
 

@@ -17,9 +17,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_cgp.common.replay_buffers import is_ours
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
-from sb3_cgp.common.spaces import check_action_space
+from sb3_cgp.common.spaces import check_action_space, have_same_layout
 from sb3_cgp.guards.contents import check_contents
 from sb3_cgp.guards.names import check_names
 
@@ -130,10 +131,12 @@ def check_replay_buffer(buffer: ReplayBuffer, model: OffPolicyAlgorithm) -> None
     """
     Check that a replay buffer fits a model.
 
-    :param buffer: the replay buffer
+    :param buffer: the replay buffer; one of a user's own class, which may store in its own way, is not checked
     :param model: the model, whose number of environments and spaces are compared with the buffer's
     :raises ValueError: if they differ
     """
+    if not is_ours(type(buffer)):
+        return
     name = type(model).__name__
     require(
         buffer.n_envs == model.n_envs,
@@ -143,7 +146,7 @@ def check_replay_buffer(buffer: ReplayBuffer, model: OffPolicyAlgorithm) -> None
         f"`{name}.load(path, env)`, or begin with an empty replay buffer",
     )
     require(
-        _stores_alike(buffer.observation_space, model.observation_space),
+        have_same_layout(buffer.observation_space, model.observation_space),
         "replay_buffer.observation_space",
         buffer.observation_space,
         f"of the shape and the kind of dtype of the model's, {model.observation_space}: load the buffer that was saved with "
@@ -156,15 +159,6 @@ def check_replay_buffer(buffer: ReplayBuffer, model: OffPolicyAlgorithm) -> None
         buffer.action_space,
         f"the model's, {model.action_space}: load the buffer that was saved with the model, or begin with an empty one",
     )
-
-
-def _stores_alike(space: spaces.Space, other: spaces.Space) -> bool:
-    """Return whether values of two spaces have the same keys and shapes, and are both integers or both floats."""
-    if isinstance(space, spaces.Dict) and isinstance(other, spaces.Dict):
-        return space.keys() == other.keys() and all(_stores_alike(space[key], other[key]) for key in space)
-    if isinstance(space, spaces.Box) and isinstance(other, spaces.Box):
-        return space.shape == other.shape and np.dtype(space.dtype).kind == np.dtype(other.dtype).kind
-    return space == other
 
 
 def _broadcasts_to(shape: tuple[int, ...], other: tuple[int, ...]) -> bool:

@@ -136,10 +136,11 @@ class BoundsWatch:
         :param transition: the transition
         """
         for key, box in self._boxes.items():
-            values = by_key(transition.observations)[key]
+            # In the data type of the space, as its bounds
+            values = np.asarray(by_key(transition.observations)[key], box.dtype)
             outside = (values < box.low) | (values > box.high)
             if outside.any():
-                self._warn(key, box, np.asarray(values), outside, transition.timestep)
+                self._warn(key, box, values, outside, transition.timestep)
                 self._boxes = {}
                 return
 
@@ -210,7 +211,7 @@ def check_final_observation(observation: Any, space: spaces.Space, timestep: int
 
 def _stored(observation: Any, space: spaces.Space) -> dict[Any, Any]:
     """Return the parts of an observation that its space has: further keys of a ``Dict`` may hold anything."""
-    return {key: by_key(observation)[key] for key in by_key(space)}
+    return {key: observation if key is None else observation[key] for key in by_key(space)}
 
 
 def _wrong_shape(name: str, shape: tuple[int, ...], expected: tuple[int, ...], timestep: int) -> ValueError:

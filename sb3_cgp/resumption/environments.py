@@ -33,7 +33,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
 from sb3_cgp.common.rules import require
-from sb3_cgp.resumption.declarations import METHODS, find_declaration, pickle_declarations, unpickle_declarations
+from sb3_cgp.resumption.declarations import (
+    METHODS,
+    find_declaration,
+    is_declared_name,
+    pickle_declarations,
+    unpickle_declarations,
+)
 from sb3_cgp.resumption.differences import require_same, warn_of_other_arguments
 from sb3_cgp.resumption.layers import SHARES, is_known, layer_state, set_layer_state
 from sb3_cgp.resumption.replayed import ReplayedEnv
@@ -149,7 +155,10 @@ def _remedy_in_processes(env: SubprocVecEnv) -> str:
     entry_point = None if spec is None else spec.entry_point
     module, _, name = entry_point.partition(":") if isinstance(entry_point, str) else ("", "", "")
     kind = getattr(sys.modules.get(module), name, None) if module else entry_point
+    # Without an id, an environment is described by the name of its class alone
+    unregistered = re.search(r"<(\w+) instance>", described)
     is_declared = isinstance(kind, type) and find_declaration(kind) is not None
+    is_declared = is_declared or (unregistered is not None and is_declared_name(unregistered[1]))
     if is_known(module) or is_declared or all(env.env_method("has_wrapper_attr", "get_training_state")):
         return f"{missing} Make sb3_cgp.resumption.RestorableEnv its outermost wrapper."
     return f"{missing} RestorableEnv alone would not help: {described} has no {METHODS}, which it needs as well."

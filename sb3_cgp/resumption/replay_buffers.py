@@ -18,13 +18,12 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_cgp.common.replay_buffers import is_ours, saves_memory
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import constructor_argument_names
 from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
 
 State = dict[str, Any]
-# The packages whose buffers do not change their arguments
-OURS = ("stable_baselines3.", "sb3_cgp.")
 # The types of a buffer's attributes that hold no state; its environment is saved as the model's
 STATELESS_TYPES = (Enum, FunctionType, np.dtype, spaces.Space, th.device, type, VecEnv)
 # SB3's fields, none of which refers to a row's position
@@ -43,7 +42,7 @@ def replay_buffer_state(buffer: ReplayBuffer) -> State:
     rows = {path: array[:n_rows] for path, array in _row_arrays(buffer)}
     return {
         "n_envs": buffer.n_envs,
-        "optimize_memory_usage": buffer.optimize_memory_usage,
+        "optimize_memory_usage": saves_memory(buffer),
         "buffer_size": buffer.buffer_size,
         "rows": {path: array.numpy(force=True) if isinstance(array, th.Tensor) else array for path, array in rows.items()},
         "attributes": plain_attributes(buffer, without={"infos", *_field_names(buffer), *_models_arguments(type(buffer))}),
@@ -59,8 +58,7 @@ def fill_replay_buffer(buffer: ReplayBuffer, state: State, changed: Collection[s
     :param changed: the names of arguments with which this buffer was made in another way, whose attributes are not restored
     :raises ValueError: if the buffer has other fields, another number of environments, or too few rows
     """
-    for name in ("n_envs", "optimize_memory_usage"):
-        given = getattr(buffer, name)
+    for name, given in {"n_envs": buffer.n_envs, "optimize_memory_usage": saves_memory(buffer)}.items():
         require(given == state[name], f"replay_buffer.{name}", given, f"{state[name]}, as was saved")
     arrays = dict(_row_arrays(buffer))
     missing = sorted(set(state["attributes"]) - set(vars(buffer)))
@@ -93,7 +91,7 @@ def check_savable(buffer: ReplayBuffer) -> None:
 
 def _models_arguments(cls: type) -> set[str]:
     """Return the names of the arguments that the model gives anew. Those of a user's own class may change, as a weight's."""
-    return set().union(*(constructor_argument_names(base) for base in cls.__mro__ if base.__module__.startswith(OURS)))
+    return set().union(*(constructor_argument_names(base) for base in cls.__mro__ if is_ours(base)))
 
 
 def _is_storage(buffer: ReplayBuffer, value: Any) -> bool:
@@ -132,7 +130,7 @@ def _fit(buffer: ReplayBuffer, state: State) -> tuple[State, State]:
     n_rows = state["buffer_size"] if is_full else position
     n_envs, given = buffer.n_envs, size * buffer.n_envs
     # The buffers whose rows refer to each other need one more row
-    is_free = {path.partition(".")[0] for path in rows} <= SB3_FIELDS and not buffer.optimize_memory_usage
+    is_free = {path.partition(".")[0] for path in rows} <= SB3_FIELDS and not saves_memory(buffer)
     allowed = f"at least {n_envs * (n_rows + (not is_free))}, as many transitions as were saved"
     require(n_rows + (not is_free) <= size, "buffer_size", given, allowed)
     if is_full:

@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
 
-from sb3_cgp.common.episodes import end_last_episode
+from sb3_cgp.common.replay_buffers import end_last_episode
 from sb3_cgp.common.rules import require
 from sb3_cgp.resumption.callback_states import callback_states, restore_callbacks
 from sb3_cgp.resumption.environments import restore_environment, state_and_obstacles
