@@ -1,5 +1,5 @@
 """
-Measure the effect of bfloat16: the share of CEM's elites that differ from float32's on a trained critic, and final rewards.
+Measure the effect of bfloat16: the share of CEM's elites that differ from float32's on a trained critic, and final returns.
 
 ``python -m benchmark.precision`` trains with both data types and writes a record per run, then ``precision.md``. Runs that
 have their record are not repeated, so that it can be interrupted, and run in several processes with different seeds.

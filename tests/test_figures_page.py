@@ -243,7 +243,7 @@ def test_runs_at_numbers_that_are_none(tmp_path: Path) -> None:
     study = read_study(write_study(tmp_path / "sweep", records))
     table = score_table([study])
     assert np.isfinite(table["score"]).all()
-    assert "the final reward is no number" in figures([study.folder], tmp_path, repetitions=20).read_text()
+    assert "the final return is no number" in figures([study.folder], tmp_path, repetitions=20).read_text()
 
 
 def test_methods_of_too_few_runs_are_named_beside_those_of_enough(tmp_path: Path) -> None:

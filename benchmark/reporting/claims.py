@@ -34,13 +34,13 @@ BASELINES = ("TD3", "SAC", "DDPG")
 COST_MARGIN = 0.1
 
 RULES = f"""\
-Rewards are compared as shares of their task's range, from 0 for the lowest return of any evaluation to 1 for the best final
+Returns are compared as shares of their task's range, from 0 for the lowest return of any evaluation to 1 for the best final
 reward, and averaged over tasks, without those on which all returns are the same; a task at two numbers of steps counts as two
 tasks. Configurations with more runs weigh more. Methods are compared on the configurations that all of them ran. A claim is
 *{SUPPORTED}* or *{CONTRADICTED}* if the whole 95 % interval lies on its side or on the other, *{NOT_DECIDED}* if not, or if a
 method or a configuration has fewer than {FEWEST_RUNS} runs; of several parts, all must be supported, and one is enough to
 contradict. The intervals are those of *How to read this page*, which few seeds make too narrow. The interquartile range, which
-measures what the paper calls spread, is that of final rewards over all configurations and seeds: it is 0 for a method that
+measures what the paper calls spread, is that of final returns over all configurations and seeds: it is 0 for a method that
 always fails, too, so read it with the stability curve. *At least as good* and *equal* allow {MARGIN:g} of the range, so that a
 variant is *lower* than others by more than this; *independent* allows {COST_MARGIN:.0%}. *Fails* means that the mean loses
 {FAILURE:g} of the range against the best of the other values, chosen by these data, where all else is equal. "Best or second

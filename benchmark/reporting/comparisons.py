@@ -25,14 +25,14 @@ RANDOM = "Random"
 HEADER = ["task", "difference", "of means (95 % interval)", "the first is", "runs"]
 HIGHER, LOWER, NOT_DISTINGUISHABLE = "higher", "lower", "not distinguishable"
 DIFFERENCES_RULE = f"""\
-In tables of differences, each row has the first method's mean final reward less the second's. The intervals of single tasks
+In tables of differences, each row has the first method's mean final return less the second's. The intervals of single tasks
 are Welch's t intervals: with 4 runs each, these contain the true difference in 96 % of the cases on normally distributed
-rewards, and in 95 % where one standard deviation is three times the other; a percentile bootstrap does in 84 %. Where a
+returns, and in 95 % where one standard deviation is three times the other; a percentile bootstrap does in 84 %. Where a
 quarter of the runs collapses by 10 standard deviations, they contain it in 98 % of the cases if runs of both methods do, but
 in 74 % if those of one method alone do, of whose 4 runs none collapses in a third of the cases. The rows on all tasks have
 means over the tasks with {FEWEST_RUNS} or more runs of both methods, each with the same weight, and twice if it was run with
-two numbers of steps, of rewards as shares of each task's range, from 0 for the lowest return of any evaluation to 1 for the
-best final reward, with the same t intervals (96 % of the cases with 4 runs on each of 5 tasks).
+two numbers of steps, of returns as shares of each task's range, from 0 for the lowest return of any evaluation to 1 for the
+best final return, with the same t intervals (96 % of the cases with 4 runs on each of 5 tasks).
 *{NOT_DISTINGUISHABLE.capitalize()}* means that the interval contains 0, which is no proof that the methods are equal; with
 fewer than {FEWEST_RUNS} runs of a method, nothing is concluded. One in twenty intervals misses the true difference by chance,
 and no correction is made for their number."""
@@ -184,7 +184,7 @@ def improvement_table(table: pd.DataFrame, methods: Sequence[str], repetitions: 
         return ""
     header = [f"{OURS} against", *tasks, *["all tasks"] * (len(tasks) > 1)]
     note = (
-        f"The probability that a random run of {OURS} has a higher final reward than one of the other method with the same "
+        f"The probability that a random run of {OURS} has a higher final return than one of the other method with the same "
         "configuration; a tie counts one half (95 % interval). There is no interval where a configuration has fewer than "
         f"{FEWEST_RUNS} runs of a method, or where no draw of the runs changes the number, as where all runs of one "
         "method are above all of the other's: by chance in one case of 35 with 4 runs each. No conclusion rests on this table."

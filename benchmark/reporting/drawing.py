@@ -1,4 +1,4 @@
-"""The figures of a study: stability, sensitivity to each axis, final rewards."""
+"""The figures of a study: stability, sensitivity to each axis, final returns."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -69,7 +69,7 @@ def draw_stability(panel: Axes, runs: pd.DataFrame, methods: Sequence[str], repe
         draw_line(panel, levels, 100 * share, method, look, drawstyle="steps-pre")
         if band is not None:
             panel.fill_between(levels, 100 * band[0], 100 * band[1], step="pre", color=look["color"], **BAND)
-    panel.set(xlabel="final reward", ylim=(-3, 103), xlim=differing_range(levels, np.array(shares)))
+    panel.set(xlabel="final return", ylim=(-3, 103), xlim=differing_range(levels, np.array(shares)))
 
 
 def differing_range(levels: np.ndarray, shares: np.ndarray) -> tuple[float, float]:
@@ -131,7 +131,7 @@ def sensitivity(study: Study, task: str) -> bytes:
 @styled
 def values(study: Study, table: pd.DataFrame, task: str, repetitions: int = REPETITIONS) -> bytes:
     """
-    Draw a task's final rewards against each axis: interquartile means over all runs with a value, with 95 % intervals.
+    Draw a task's final returns against each axis: interquartile means over all runs with a value, with 95 % intervals.
 
     :param study: the study, with an axis
     :param table: its runs' scores
@@ -160,7 +160,7 @@ def values(study: Study, table: pd.DataFrame, task: str, repetitions: int = REPE
                 panel.errorbar(places, middles, lengths, label=method, **look, markersize=5, linewidth=1.2, capsize=2)
         panel.set_xticks(range(len(axis_values)), [value_in_words(value) for value in axis_values])
         panel.set(xlabel=axis_in_words(axis))
-    grid[0].set_ylabel("final reward")
+    grid[0].set_ylabel("final return")
     legend(figure, grid, task)
     return png(figure)
 
@@ -168,7 +168,7 @@ def values(study: Study, table: pd.DataFrame, task: str, repetitions: int = REPE
 @styled
 def final_rewards(study: Study, table: pd.DataFrame, repetitions: int = REPETITIONS) -> bytes:
     """
-    Draw the final rewards of a study without axes: each run's, and their interquartile mean with its 95 % interval.
+    Draw the final returns of a study without axes: each run's, and their interquartile mean with its 95 % interval.
 
     :param study: the study
     :param table: its runs' scores
@@ -189,6 +189,6 @@ def final_rewards(study: Study, table: pd.DataFrame, repetitions: int = REPETITI
             if found.interval is not None:
                 panel.plot(found.interval, [place, place], color=look["color"], linewidth=2.5, alpha=0.5)
         panel.set_yticks(range(len(methods)), methods)
-        panel.set(title=task, xlabel="final reward")
+        panel.set(title=task, xlabel="final return")
     grid[0].invert_yaxis()
     return png(figure)

@@ -41,8 +41,8 @@ MINUTES = (
 )
 SENSITIVITY = "learning curves, every seed (thin) and the interquartile mean over seeds (bold), on one vertical scale."
 STABILITY = (
-    "Stability: the share of runs, {}, that reach at least a final reward, with pointwise 95 % bands, "
-    "from the lowest reward on at which methods are more than 15 percentage points apart."
+    "Stability: the share of runs, {}, that reach at least a final return, with pointwise 95 % bands, "
+    "from the lowest return on at which methods are more than 15 percentage points apart."
 )
 
 
@@ -152,7 +152,7 @@ def read_runtime(out: Path) -> dict[str, Any] | None:
 
 def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
     """
-    Draw a study's figures: with axes, its stability and its sensitivity; without, its learning curves and final rewards.
+    Draw a study's figures: with axes, its stability and its sensitivity; without, its learning curves and final returns.
 
     :param study: the study
     :param repetitions: number of bootstrap samples
@@ -178,7 +178,7 @@ def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
             if times_of(study, task).runs:
                 drawn = curves_by_minutes(study, task, repetitions)
                 pictures.append(picture("learning_curves_by_minutes", minutes_caption(study, task), drawn, task))
-        final = "Final rewards: interquartile mean, its 95 % interval, and every run as a stroke."
+        final = "Final returns: interquartile mean, its 95 % interval, and every run as a stroke."
         return [*pictures, picture("final_rewards", final, final_rewards(study, table, repetitions))]
 
     axes = " and ".join(axis_in_words(axis) for axis in study.axes)
@@ -187,7 +187,7 @@ def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
     for task in study.tasks:
         lines = f"Sensitivity to {axes} on {task}: {SENSITIVITY}"
         pictures.append(picture("sensitivity", lines, sensitivity(study, task), task))
-        points = f"Final rewards on {task} by {axes}: interquartile means over all runs with a value, and 95 % intervals."
+        points = f"Final returns on {task} by {axes}: interquartile means over all runs with a value, and 95 % intervals."
         pictures.append(picture("values", points, values(study, table, task, repetitions), task))
     return pictures
 

@@ -28,7 +28,7 @@ class Comparison:
     The light setting against the paper's on a task.
 
     :param place: the task, its steps and the study
-    :param reward: the difference of mean final rewards
+    :param reward: the difference of mean final returns
     :param share: the same as a share of the task's range
     :param form: the format of rewards
     :param failed: how many runs of each failed, which count with the task's lowest return

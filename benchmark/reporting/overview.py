@@ -29,7 +29,7 @@ from benchmark.reporting.sections import heading
 from benchmark.reporting.verdicts import LIGHT, OURS
 
 NOTE = f"""\
-A return is the interquartile mean of the final rewards, with its 95 % interval; in a study of hyperparameters, over all of its
+A return is the interquartile mean of the final returns, with its 95 % interval; in a study of hyperparameters, over all of its
 configurations. *Higher* and *lower* are differences of means whose whole 95 % interval lies on that side; nothing is concluded
 from fewer than {FEWEST_RUNS} runs of a method."""
 
@@ -37,7 +37,7 @@ from fewer than {FEWEST_RUNS} runs of a method."""
 @dataclass(frozen=True)
 class Level:
     """
-    The final rewards of a method on a task.
+    The final returns of a method on a task.
 
     :param method: the method
     :param reward: the interquartile mean

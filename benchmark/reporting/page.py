@@ -16,17 +16,17 @@ TITLE = "# Results of sweeps"
 READING = f"""\
 ## How to read this page
 
-A run's score, its *final reward*, is the mean return of its final model over {FINAL_EPISODES} episodes, which are the same for
+A run's score, its *final return*, is the mean return of its final model over {FINAL_EPISODES} episodes, which are the same for
 all runs on a task. {FAILURE_RULE}
 
 Numbers that seem to contradict each other:
 
-- The last point of a learning curve is not the final reward: it is the mean over the few episodes of one evaluation, which
-  begin in other states. Until an offline variant's policy is trained, at the end, its curve is that of CEM; its final reward
+- The last point of a learning curve is not the final return: it is the mean over the few episodes of one evaluation, which
+  begin in other states. Until an offline variant's policy is trained, at the end, its curve is that of CEM; its final return
   is the policy's.
-- The interquartile mean of the final rewards is not their mean: it leaves out the lowest and the highest quarter of the runs.
+- The interquartile mean of the final returns is not their mean: it leaves out the lowest and the highest quarter of the runs.
   Of four runs it is the mean of the middle two, so that one run that failed changes the mean and the interval alone. Tables
-  of final rewards have both; differences between methods are differences of means, those of the claims on imitation and on
+  of final returns have both; differences between methods are differences of means, those of the claims on imitation and on
   offline training of interquartile means.
 - The same method, task and number of steps can have other numbers in other studies and on other pages: hyperparameters, the
   number of random steps at the start and the networks differ. Each study's section lists its own.
@@ -36,15 +36,15 @@ The figures and tables of a study use its own runs, and the figure of all sweeps
 caption names{{claims}}. {SIDE_RUNS_RULE}{{papers}}
 
 Intervals are 95 % percentile bootstrap intervals by rliable; runs are drawn within each task and configuration. Few runs make
-them too narrow: on normally distributed rewards, the interval of an interquartile mean of 2, 3, 4, 5, 10 runs contains the
+them too narrow: on normally distributed returns, the interval of an interquartile mean of 2, 3, 4, 5, 10 runs contains the
 true value in 50, 75, 88, 90, 93 % of the cases. Over several configurations with 4 runs of each it does in 90 %, however many
 configurations there are. There is no interval where a configuration has fewer than {FEWEST_RUNS} runs.
 
 {DIFFERENCES_RULE}"""
 
 SHARES = (
-    "Rewards in this table are shares of their task's range, from 0 for the lowest return of any evaluation to 1 for the best "
-    "final reward."
+    "Returns in this table are shares of their task's range, from 0 for the lowest return of any evaluation to 1 for the best "
+    "final return."
 )
 
 # What the page adds where it judges the paper's claims
@@ -70,7 +70,7 @@ def introduction(studies: Sequence[Study]) -> str:
     :return: the paragraph, in Markdown
     """
     ended = sum(len(study.records) for study in studies)
-    text = f"The final rewards and learning curves of {ended:,} training runs."
+    text = f"The final returns and learning curves of {ended:,} training runs."
     unfinished = [study for study in studies if len(study.records) < study.facts["runs_planned"]]
     if unfinished:
         counts = [f"{study.name} ({len(study.records)} of {study.facts['runs_planned']} runs)" for study in unfinished]

@@ -20,7 +20,7 @@ from benchmark.reporting.verdicts import OURS
 
 # Kinds of errors that are listed for a study
 ERRORS = 5
-FINAL_REWARDS = "**Final rewards**"
+FINAL_REWARDS = "**Final returns**"
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def state(study: Study) -> list[str]:
     lines = [f"{ended:,} of {planned:,} planned runs have ended, {len(lost):,} of them failed."]
     if ended < planned:
         lines[0] += " **The rest is missing: the results below may change.**"
-    reasons = Counter((record.method, _first_line(record.error or "the final reward is no number")) for record in lost)
+    reasons = Counter((record.method, _first_line(record.error or "the final return is no number")) for record in lost)
     errors = [
         f"- {method}: `{reason}` ({number} run{'s' * (number > 1)})"
         for (method, reason), number in reasons.most_common(ERRORS)
@@ -238,7 +238,7 @@ def comparison_tables(table: pd.DataFrame, study: Study, repetitions: int = REPE
 
 def reward_tables(table: pd.DataFrame, study: Study, repetitions: int = REPETITIONS) -> list[str]:
     """
-    Tabulate final rewards: by method, and, in a section that is folded, by configuration.
+    Tabulate final returns: by method, and, in a section that is folded, by configuration.
 
     :param table: the runs' scores
     :param study: the study

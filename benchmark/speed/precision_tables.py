@@ -20,7 +20,7 @@ the mean over the seeds and the lowest seed's."""
 
 def compare(float32: Sequence[float], bfloat16: Sequence[float]) -> dict[str, Any]:
     """
-    Compare final rewards.
+    Compare final returns.
 
     :param float32: each seed's mean return with float32
     :param bfloat16: each seed's mean return with bfloat16
