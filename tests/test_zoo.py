@@ -226,6 +226,8 @@ def test_a_folder_that_the_user_chose_is_kept_and_none_is_given_without_a_callba
 def test_trials_of_optuna_save_no_states(path, tmp_path, monkeypatch):
     """Two trials, which could not share a folder, with the callbacks that the file has besides."""
     monkeypatch.chdir(tmp_path)
+    # A policy's offline training, which a trial may sample, ends soon
+    monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
     zoo.register()
     checkpoint = {"sb3_cgp.TrainingCheckpointCallback": {"save_freq": 10, "path": path}}
     small = TINY | {"learning_starts": 10, "callback": [checkpoint, "sb3_cgp.hparams.HParamsCallback"]}
