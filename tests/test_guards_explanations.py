@@ -146,10 +146,18 @@ class OldWrapper(gym.Wrapper):
         return observation, reward, done, info
 
 
+class OldWrapperWithAName(OldWrapper):
+    def step(self, action):
+        self.base_env = self.env
+        observation, reward, done, info = self.base_env.step(action)
+        return observation, reward, done, info
+
+
 @pytest.mark.parametrize("wrap", [bare, monitored, wrapped])
-def test_a_wrapper_of_the_old_api_is_told_what_an_environment_returns(wrap):
+@pytest.mark.parametrize("wrapper", [OldWrapper, OldWrapperWithAName])
+def test_a_wrapper_of_the_old_api_is_told_what_an_environment_returns(wrapper, wrap):
     with pytest.raises(ValueError, match=r"The environment's `step` must return five values"):
-        GuardedTD3("MlpPolicy", wrap(OldWrapper(Located())), **SMALL).learn(20)
+        GuardedTD3("MlpPolicy", wrap(wrapper(Located())), **SMALL).learn(20)
 
 
 class UnpackingFive(gym.Wrapper):

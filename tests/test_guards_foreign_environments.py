@@ -7,6 +7,7 @@ from collections import ChainMap, OrderedDict, UserDict
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from guarded import IGNORED_WARNINGS, SMALL, GuardedTD3, Located, assert_no_episode_runs_into_another, located, make_model
 from stable_baselines3 import TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor, VecNormalize
@@ -124,6 +125,97 @@ def test_the_environments_are_in_their_list_during_a_training_and_after_it():
     assert model.env.envs is envs
     assert envs == [second]
     assert second.steps == 13 % 3
+
+
+class Restored(Located):
+    """Has infos of an environment within, whose episodes end when its own do not."""
+
+    def step(self, action):
+        *others, info = super().step(action)
+        return *others, info | ({"terminal_observation": np.zeros(5)} if self.steps == 3 else {})
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor])
+@pytest.mark.parametrize("algorithm", [TD3, GuardedTD3])
+def test_an_environment_may_have_the_key_of_final_observations_elsewhere(algorithm, wrap):
+    model = algorithm("MlpPolicy", wrap(DummyVecEnv([Restored])), **SMALL).learn(20)
+    assert model.replay_buffer.dones.sum() == 20 // 7
+
+
+class Overflowing(Located):
+    """Ends its second episode with an infinite observation."""
+
+    ends = 0
+
+    def step(self, action):
+        observation, *others = super().step(action)
+        self.ends += self.steps == self.length
+        is_second = self.steps == self.length and self.ends == 2
+        return np.full(2, np.inf, np.float32) if is_second else observation, *others
+
+
+class Iterating(DummyVecEnv):
+    """Takes each environment once in a step."""
+
+    def step_wait(self):
+        for index, env in enumerate(self.envs):
+            observation, self.buf_rews[index], terminated, truncated, info = env.step(self.actions[index])
+            self.buf_dones[index], self.buf_infos[index] = terminated or truncated, info
+            info["TimeLimit.truncated"] = truncated and not terminated
+            if self.buf_dones[index]:
+                info["terminal_observation"] = observation
+                observation, self.reset_infos[index] = env.reset()
+            self._save_obs(index, observation)
+        return self._obs_from_buf(), self.buf_rews.copy(), self.buf_dones.copy(), copy.deepcopy(self.buf_infos)
+
+
+@pytest.mark.parametrize("vec_env", [DummyVecEnv, Iterating])
+def test_an_infinite_final_observation_is_refused_before_it_is_clipped(vec_env):
+    model = GuardedTD3("MlpPolicy", VecNormalize(vec_env([Overflowing])), **SMALL)
+    with pytest.raises(ValueError, match=r"NaN or infinite \(in float32\) terminal observation at environment step 14"):
+        model.learn(30)
+    assert np.isfinite(model.replay_buffer.next_observations).all()
+
+
+def test_what_a_nested_training_has_refused_does_not_end_the_outer_one():
+    env = VecNormalize(DummyVecEnv([Overflowing]))
+
+    def train():
+        with pytest.raises(ValueError, match="terminal observation"):
+            GuardedTD3("MlpPolicy", env, **SMALL).learn(30)
+
+    assert GuardedTD3("MlpPolicy", env, **SMALL).learn(30, Do(5, train)).num_timesteps == 30
+
+
+def test_the_environments_may_be_held_in_another_way():
+    class Computed(DummyVecEnv):
+        envs = property(lambda self: self.kept, lambda self, envs: vars(self).update(kept=envs))
+
+    held = DummyVecEnv([Located])
+    held.envs = tuple(held.envs)
+    for env in (held, Computed([Located])):
+        assert GuardedTD3("MlpPolicy", env, **SMALL).learn(20).replay_buffer.dones.sum() == 20 // 7
+    assert type(held.envs) is tuple
+
+
+class Tensors(VecEnvWrapper):
+    """Returns observations as tensors."""
+
+    def reset(self):
+        return th.as_tensor(self.venv.reset())
+
+    def step_wait(self):
+        observations, *others, infos = self.venv.step_wait()
+        for info in infos:
+            info.pop("terminal_observation", None)
+        return th.as_tensor(observations), *others, infos
+
+
+def test_an_episode_of_tensors_goes_on_in_a_second_training():
+    model = make_model("n-step", env=Tensors(located()))
+    model.learn(10).learn(10, reset_num_timesteps=False)
+    np.testing.assert_array_equal(model.replay_buffer.dones[:20].nonzero()[0], [6, 13])
+    assert model.replay_buffer.timeouts[:20].nonzero()[0].tolist() == [6, 13]
 
 
 class WithParts(Located):

@@ -122,6 +122,14 @@ def test_an_actor_that_is_frozen_stays_and_the_critics_learn(arguments):
     assert not th.equal(model.actor.mu[2].bias, before["actor.mu.2.bias"])
 
 
+@pytest.mark.parametrize("algorithm", [TD3, CGP])
+def test_a_critic_that_is_frozen_ends_the_training_as_in_sb3(algorithm):
+    model = algorithm("MlpPolicy", located(), **SMALL)
+    model.critic.requires_grad_(False)
+    with pytest.raises(RuntimeError, match="does not require grad"):
+        model.learn(20)
+
+
 @pytest.mark.parametrize("extractor", [Extractor, Caching])
 def test_a_trial_leaves_no_trace(extractor):
     class Unguarded(GuardedTD3):

@@ -10,6 +10,7 @@ from small_models import make_model
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     EvalCallback,
+    EventCallback,
     StopTrainingOnMaxEpisodes,
     StopTrainingOnNoModelImprovement,
 )
@@ -320,3 +321,26 @@ class TestOffline:
             model.train_policy()
         with pytest.raises(ValueError, match="`max_steps` is 0"):
             make_model().train_policy(max_steps=0)
+
+
+def test_a_callback_may_make_another_one_at_its_first_step():
+    class Making(EventCallback):
+        def _on_step(self):
+            if self.callback is None:
+                self.callback = Looking()
+                self.callback.init_callback(self.model)
+                return True
+            self.locals["infos"][0]["seen"] = self.locals["infos"][0].get("seen", 0) + 1
+            return self._on_event()
+
+    class Looking(BaseCallback):
+        def _on_step(self):
+            seen.append(dict(self.locals["infos"][0]))
+            return True
+
+    seen = []
+    model = make_model(policy_loss="cgp").learn(20)
+    with pytest.warns(UserWarning, match="has not reached a plateau"):
+        model.train_policy(3, callback=Making())
+    # Each step has infos of its own
+    assert seen == [{"seen": 1}] * 2

@@ -117,7 +117,7 @@ def test_vec_normalize_normalises_what_was_observed_to_the_bit(env_class):
 def test_normalisation_that_comes_when_there_are_rows_warns_of_what_they_have_lost():
     model = make_model(DummyVecEnv([FarFromZero])).learn(30)
     model.set_env(VecNormalize(DummyVecEnv([FarFromZero])))
-    with pytest.warns(UserWarning, match="The replay buffer has observations in float32, and `env` normalises them now"):
+    with pytest.warns(UserWarning, match="The replay buffer stores observations in float32, and `env` normalises them now"):
         model.learn(5)
 
 

@@ -202,3 +202,52 @@ def test_an_own_buffer_for_dict_observations_may_return_several_steps():
     assert model.learn(20).learn(20, reset_num_timesteps=False)._n_updates == 34
     with pytest.raises(ValueError, match="`n_steps` is 3, but must be 1 with a Dict observation space"):
         CGP("MultiInputPolicy", DummyVecEnv([lambda: Located(goals=True)]), **SMALL, n_steps=3)
+
+
+class Plain(ReplayBuffer):
+    """A user's own class that stores as SB3's does."""
+
+
+@pytest.mark.parametrize("buffer_class", [ReplayBuffer, Plain, Counting])
+def test_a_class_that_stores_as_sb3s_is_checked_as_sb3s(buffer_class, tmp_path):
+    def make(n_envs=1, high=1.0):
+        envs = located(n_envs)
+        envs.action_space = spaces.Box(-high, high, (1,), np.float32)
+        return CGP("MlpPolicy", envs, replay_buffer_class=buffer_class, **SMALL)
+
+    model = make().learn(20)
+    model.save_replay_buffer(tmp_path / "buffer")
+    for other, name in ((make(n_envs=2), "n_envs"), (make(high=2.0), "action_space")):
+        kept = other.replay_buffer
+        with pytest.raises(ValueError, match=rf"`replay_buffer.{name}`"):
+            other.load_replay_buffer(tmp_path / "buffer")
+        assert other.replay_buffer is kept
+    model.replay_buffer.actions[3] = 7.0
+    with pytest.raises(ValueError, match=r"`replay_buffer.actions\[3\]` is 7.0, but must be scaled"):
+        model.learn(20)
+
+
+@pytest.mark.parametrize("buffer_class", [ReplayBuffer, Plain, Counting])
+def test_such_a_class_stores_what_is_normalised_as_it_is(buffer_class):
+    model = CGP("MlpPolicy", DummyVecEnv([Wide]), replay_buffer_class=buffer_class, **SMALL)
+    model.set_env(VecNormalize(DummyVecEnv([Wide])))
+    assert model.learn(5).replay_buffer.observations.dtype == np.float64
+    model = CGP("MlpPolicy", DummyVecEnv([Wide]), replay_buffer_class=buffer_class, **SMALL).learn(5)
+    model.set_env(VecNormalize(DummyVecEnv([Wide])))
+    with pytest.warns(UserWarning, match="The replay buffer stores observations in float32"):
+        model.learn(5)
+
+
+@pytest.mark.parametrize("algorithm", [TD3, CGP])
+def test_an_own_buffer_may_mark_what_is_unknown_by_nan(algorithm):
+    class Unknown(ReplayBuffer):
+        def add(self, obs, next_obs, *args):
+            super().add(obs, next_obs, *args)
+            self.next_observations[self.pos - 1, :, 1] = np.nan
+
+        def _get_samples(self, *args, **kwargs):
+            batch = super()._get_samples(*args, **kwargs)
+            return batch._replace(next_observations=batch.next_observations.nan_to_num())
+
+    model = algorithm("MlpPolicy", located(), replay_buffer_class=Unknown, **SMALL).learn(20)
+    assert model.learn(20, reset_num_timesteps=False).replay_buffer.size() == 40

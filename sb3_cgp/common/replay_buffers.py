@@ -15,12 +15,23 @@ OURS = ("stable_baselines3.", "sb3_cgp.")
 
 def is_ours(buffer_class: type) -> bool:
     """
-    Return whether a class of replay buffers is SB3's or this package's. A user's own may store anything in its own way.
+    Return whether a class of replay buffers is SB3's or this package's.
 
     :param buffer_class: the class
     :return: whether it is
     """
     return buffer_class.__module__.startswith(OURS)
+
+
+def stores_as_given(buffer_class: type[ReplayBuffer]) -> bool:
+    """
+    Return whether a class of replay buffers stores what the model gives it, as SB3's classes do.
+
+    :param buffer_class: the class
+    :return: False for a user's own class with a constructor or a method ``add`` of its own, which may store anything
+    """
+    methods = (buffer_class.__init__, buffer_class.add)
+    return all(method.__module__.startswith(OURS) for method in methods)
 
 
 def saves_memory(buffer: ReplayBuffer) -> bool:

@@ -294,7 +294,6 @@ class CGP(OffPolicyAlgorithm):
             callback = self._init_callback(callback)
             callback = with_progress_bar(callback) if progress_bar else callback
             callback.on_training_start(learn_locals(self, callback, max_steps, progress_bar), globals())
-            callback.update_locals(rollout_locals(self, callback))
             for n_steps in range(1, max_steps + 1):
                 # Callbacks may have evaluated the policy. Batch norm of the critics keeps its statistics.
                 self.policy.set_training_mode(True)
@@ -306,6 +305,7 @@ class CGP(OffPolicyAlgorithm):
                 losses.append(loss.detach())
                 if n_steps % self.target_update_interval == 0:
                     update_average(self.actor, self.actor_target, self.tau)
+                callback.update_locals(rollout_locals(self, callback))
                 if is_stopped := not callback.on_step():
                     break
                 if n_steps % offline.ROUND == 0:

@@ -219,7 +219,7 @@ class CudaGraphAlgorithm(CGP):
             super()._descend(name, loss)
             return
         skip_step_if(optimizer, self._loss_watch.see(name, loss))
-        if loss.requires_grad:
+        if loss.requires_grad or name != "actor":
             # The core's own: a guard in between would read the loss on the host
             CGP._descend(self, name, loss)
 

@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_cgp.common.replay_buffers import is_ours
+from sb3_cgp.common.replay_buffers import is_ours, stores_as_given
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer, fits_device, leaves_room
@@ -124,14 +124,12 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
         buffer, space = self.replay_buffer, self._stored_space()
         # `set_env` may have added or removed VecNormalize since
-        if buffer is not None and is_ours(type(buffer)) and buffer.observation_space != space:
+        if buffer is not None and buffer.observation_space != space:
             if buffer.size() == 0 and buffer.observation_space == self._allocated_for:
                 self.replay_buffer = None
-            elif buffer.size() > 0 and self._is_normalized:
-                message = "The replay buffer has observations in float32, and `env` normalises them now: those near their"
-                warnings.warn(
-                    f"{message} mean may have lost their differences. Train a new model to keep these.", stacklevel=2
-                )
+            elif self._is_normalized and stores_as_given(type(buffer)):
+                message = "The replay buffer stores observations in float32, and `env` normalises them now: those near their"
+                warnings.warn(f"{message} mean may lose their differences. Train a new model to keep these.", stacklevel=2)
         buffer = self._ensure_replay_buffer()
         if self._chooses_n_step_returns(type(buffer)):
             assert isinstance(buffer, NStepReplayBuffer)

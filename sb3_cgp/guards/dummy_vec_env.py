@@ -22,7 +22,8 @@ class DummyVecEnvGuard(OffPolicyAlgorithm):
     An algorithm that sees the observations of a ``DummyVecEnv`` as its environments return them.
 
     It refuses those that NumPy would broadcast to the array in which a ``DummyVecEnv`` collects them. It checks an episode's
-    final one before ``VecNormalize`` clips it, and copies it before the environment's ``reset`` can overwrite it.
+    final one before ``VecNormalize`` clips it, and copies it before the environment's ``reset`` can overwrite it; the latter
+    not in a subclass with a ``step_wait`` that takes no environment from ``envs`` between its step and its reset.
     """
 
     def learn(self: SelfDummyVecEnvGuard, *args: Any, **kwargs: Any) -> SelfDummyVecEnvGuard:
@@ -69,6 +70,8 @@ class _ObservationObserver:
         :param obs: its observation
         :raises ValueError: if it is of a wrong shape, or ``reset`` returns no dictionary beside it
         """
+        # Where a subclass of ``DummyVecEnv`` has not taken the environment from its list before its reset
+        self.save_final(env_idx)
         model = None if self._model is None else self._model()
         if model is not None:
             check_reset_info(self._env.reset_infos[env_idx])
@@ -87,10 +90,13 @@ class _ObservationObserver:
         info = self._env.buf_infos[env_idx]
         final = info.get("terminal_observation")
         model = None if self._model is None else self._model()
-        if final is None or final is self._seen[env_idx] or model is None:
+        # An environment may have a use of its own for this key
+        is_final = final is not None and self._env.buf_dones[env_idx] and final is not self._seen[env_idx]
+        if model is None or not is_final:
             return
+        # One that is refused is not found by another training on this environment
+        del info["terminal_observation"]
         space, timestep = self._env.observation_space, model.num_timesteps + self._env.num_envs
-        self._seen[env_idx] = final
         if self._is_clipped:
             check_final_observation(final, space, timestep)
         else:
@@ -128,13 +134,18 @@ class _ObservedEnvironments(list[gym.Env]):
 @contextmanager
 def _observed(env: DummyVecEnv, observer: _ObservationObserver) -> Iterator[None]:
     """Let an observer see the final observations of a ``DummyVecEnv`` for a time."""
+    if "envs" not in vars(env):
+        # A property of a subclass
+        yield
+        return
     envs = env.envs
     env.envs = _ObservedEnvironments(envs, observer)
     try:
         yield
     finally:
-        # A callback may have replaced some
-        envs[:] = env.envs
+        if isinstance(envs, list):
+            # A callback may have replaced some
+            envs[:] = env.envs
         env.envs = envs
 
 

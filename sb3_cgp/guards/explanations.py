@@ -28,7 +28,7 @@ OLD_STEP = (
     f"means that the episode ran out of time. {OLD_API}"
 )
 # The call of an environment, of one of several, of a wrapper's base class, or of a method that replaces another
-CALL = re.compile(r"(?:\b(?:env\w*|super\(\)|self)(?:\[[^]]*\])?\.|return )(step|reset)\(")
+CALL = re.compile(r"(?:(?<![^\W_])(?:env\w*|super\(\)|self)(?:\[[^]]*\])?\.|return )(step|reset)\(")
 OLD_VEC_STEP = (
     "The vectorised environment's `step_wait` must return four values, `observations, rewards, dones, infos`, as SB3's do: "
     "`dones` are ends of any kind, and the info of an episode that ran out of time has `TimeLimit.truncated` True."

@@ -1,4 +1,4 @@
-"""Losses that are NaN or infinite, or that nothing is trained by."""
+"""Losses that are NaN or infinite, or those of a frozen actor."""
 
 import math
 
@@ -10,7 +10,7 @@ class LossGuard(OffPolicyAlgorithm):
     """
     An algorithm, with a method ``_descend``, that takes no optimizer step down a loss that is NaN or infinite.
 
-    Nor does it down a loss that depends on frozen networks alone, which have no gradient.
+    Nor does it down the loss of a frozen actor, which has no gradient.
     """
 
     def _descend(self, name: str, loss: th.Tensor) -> None:
@@ -27,6 +27,6 @@ class LossGuard(OffPolicyAlgorithm):
                 f"The {name} loss is {value} at gradient step {self._n_updates}, environment step {self.num_timesteps}. "
                 f"The {name} is as before that step."
             )
-        # Not where the user has frozen the network, as by `requires_grad_(False)`
-        if loss.requires_grad:
+        # Not where the user has frozen the actor, by `requires_grad_(False)`; TD3's loss of the actor has a gradient even so
+        if loss.requires_grad or name != "actor":
             super()._descend(name, loss)  # type: ignore[misc]  # of the algorithm that this class is mixed into

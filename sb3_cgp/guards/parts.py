@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_cgp.common.replay_buffers import is_ours
+from sb3_cgp.common.replay_buffers import stores_as_given
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
 from sb3_cgp.common.spaces import check_action_space, have_same_layout
@@ -131,11 +131,11 @@ def check_replay_buffer(buffer: ReplayBuffer, model: OffPolicyAlgorithm) -> None
     """
     Check that a replay buffer fits a model.
 
-    :param buffer: the replay buffer; one of a user's own class, which may store in its own way, is not checked
+    :param buffer: the replay buffer; one of a user's own class that stores in its own way is not checked
     :param model: the model, whose number of environments and spaces are compared with the buffer's
     :raises ValueError: if they differ
     """
-    if not is_ours(type(buffer)):
+    if not stores_as_given(type(buffer)):
         return
     name = type(model).__name__
     require(
