@@ -51,16 +51,17 @@ def stores_rows(buffer: ReplayBuffer) -> bool:
     :param buffer: the replay buffer
     :return: whether it has SB3's arrays, or tensors in their place, with a row of all environments for each step
     """
-    observations = ["observations"] if saves_memory(buffer) else ["observations", "next_observations"]
-    names = [*observations, "dones"] if saves_memory(buffer) else [*observations, "dones", "timeouts"]
-    if not all(hasattr(buffer, name) for name in [*names, "obs_shape"]):
+    observations, ends = ["observations", "next_observations"], ["dones", "timeouts"]
+    if saves_memory(buffer):
+        observations, ends = observations[:1], ends[:1]
+    if not all(hasattr(buffer, name) for name in [*observations, *ends, "obs_shape"]):
         return False
     rows = (buffer.buffer_size, buffer.n_envs)
     stored = [by_key(getattr(buffer, name)) for name in observations]
     # SB3's attribute is a dictionary for `Dict` spaces
     shapes = {key: (*rows, *shape) for key, shape in by_key(buffer.obs_shape).items()}
     return all({key: _shape_of(array) for key, array in each.items()} == shapes for each in stored) and all(
-        _shape_of(getattr(buffer, name)) == rows for name in names[len(observations) :]
+        _shape_of(getattr(buffer, name)) == rows for name in ends
     )
 
 

@@ -91,10 +91,11 @@ def continues_last_episode(buffer: ReplayBuffer, observations: Any) -> bool:
         return False
     goes_on = _array(buffer.dones[buffer.pos - 1]) == 0
     stored, row = (buffer.observations, buffer.pos) if saves_memory(buffer) else (buffer.next_observations, buffer.pos - 1)
-    shown, last = by_key(observations), {key: _array(each[row]) for key, each in by_key(stored).items()}
+    last = {key: _array(each[row]) for key, each in by_key(stored).items()}
+    shown = {key: _array(each) for key, each in by_key(observations).items() if key in last}
     # A user's own class may store something else of them
-    return all(key in shown and _array(shown[key]).size == each.size for key, each in last.items()) and all(
-        np.array_equal(each[goes_on], _array(shown[key]).reshape(each.shape).astype(each.dtype)[goes_on], equal_nan=True)
+    return all(key in shown and shown[key].size == each.size for key, each in last.items()) and all(
+        np.array_equal(each[goes_on], shown[key].reshape(each.shape).astype(each.dtype)[goes_on], equal_nan=True)
         for key, each in last.items()
     )
 
