@@ -229,3 +229,11 @@ def undrawn(monkeypatch):
     """Write empty files in place of pictures, for tests of what the page says."""
     for name in ("curves_by_steps", "curves_by_minutes", "final_rewards", "stability", "sensitivity", "values"):
         monkeypatch.setattr(f"benchmark.reporting.figures.{name}", lambda *args: b"")
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Keep the figures of learning curves in place of their pictures."""
+    kept = []
+    monkeypatch.setattr("benchmark.reporting.learning_curves.png", lambda figure: kept.append(figure) or b"")
+    return kept

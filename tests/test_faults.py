@@ -1,178 +1,22 @@
-"""What happens when an environment or the machine fails: the table of docs/trust.md, a test for each row."""
+"""What happens when an environment fails; and that each row of the table of docs/trust.md has its test."""
 
-import errno
-import multiprocessing
-import os
 import re
-import signal
-import stat
-import threading
-import time
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
-from environments import Doubles
+from faulty_environments import SMALL, Failing, raise_error, subproc, with_observation, with_reward
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecNormalize
-from trainings import Do
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_cgp import CGP
 from sb3_cgp.guards.transitions import BoundsWatch, Transition
-from sb3_cgp.resumption import RestorableEnv
-from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback
-from sb3_cgp.resumption.store import StateStore
 
 ROOT = Path(__file__).parent.parent
 
-SMALL = dict(buffer_size=200, learning_starts=10, batch_size=8, cem_samples=8, cem_elites=2, policy_kwargs=dict(net_arch=[8]))
-
 UNBOUNDED = spaces.Box(-np.inf, np.inf, (1,))
-
-
-class Failing(Doubles):
-    """Calls a function at a step, and returns what it makes of the step's five values."""
-
-    def __init__(self, fault=None, at=15, observation_space=Doubles.observation_space):
-        self.fault, self.at, self.total, self.steps = fault, at, 0, 0
-        self.observation_space = observation_space
-
-    def step(self, action):
-        self.total += 1
-        values = super().step(action)
-        return values if self.fault is None or self.total != self.at else self.fault(*values)
-
-    def get_training_state(self):
-        return {"steps": self.steps, "total": self.total, "random": self.np_random.bit_generator.state}
-
-    def set_training_state(self, state):
-        self.steps, self.total = state["steps"], state["total"]
-        self.np_random.bit_generator.state = state["random"]
-
-
-def raise_error(*_):
-    raise ZeroDivisionError("the simulator is unstable")
-
-
-def kill_worker(*_):
-    os.kill(os.getpid(), signal.SIGKILL)
-    time.sleep(60)
-
-
-def with_observation(observation):
-    return lambda _, *others: (observation, *others)
-
-
-def with_reward(reward):
-    return lambda observation, _, *others: (observation, reward, *others)
-
-
-def subproc(*faults, start_method="fork"):
-    # "fork" starts in milliseconds, SB3's default in seconds
-    return SubprocVecEnv([lambda fault=fault: Failing(fault) for fault in faults], start_method=start_method)
-
-
-def is_running(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
-
-
-def assert_buried(env):
-    """No worker is left, and closing the environment neither hangs nor raises."""
-    assert not any(is_running(process.pid) for process in env.processes)
-    assert multiprocessing.active_children() == []
-    start = time.monotonic()
-    env.close()
-    assert time.monotonic() - start < 1
-    assert not [thread for thread in threading.enumerate() if "_run" in thread.name]
-
-
-@pytest.mark.parametrize("start_method", ["fork", "forkserver"])
-@pytest.mark.parametrize("index", [0, 1])
-def test_a_worker_that_is_killed_is_named_and_the_others_end(start_method, index):
-    if start_method == "forkserver" and index == 0:
-        pytest.skip("the second worker's death is seen in the same way")
-    env = subproc(*[kill_worker if i == index else None for i in range(3)], start_method=start_method)
-    pid = env.processes[index].pid
-    model = CGP("MlpPolicy", env, **SMALL)
-    message = (
-        rf"died at environment step 42: of 3 workers, worker {index} \(process {pid}\) was killed by signal 9 \(Killed\)\."
-    )
-    with pytest.raises(RuntimeError, match=message) as caught:
-        model.learn(300)
-    assert isinstance(caught.value.__cause__, (EOFError, ConnectionError))
-    assert_buried(env)
-
-
-def ignore_termination(*values):
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    return values
-
-
-def test_workers_that_do_not_heed_sigterm_are_ended_too(monkeypatch):
-    """Forked after pygame has begun, they take SIGTERM for an event, and hold the dead one's pipe open."""
-    monkeypatch.setattr("sb3_cgp.guards.workers.GRACE", 0.5)
-    env = SubprocVecEnv([lambda: Failing(ignore_termination, at=1), lambda: Failing(kill_worker)], start_method="fork")
-    with pytest.raises(RuntimeError, match="worker 1"):
-        CGP("MlpPolicy", env, **SMALL).learn(300)
-    assert_buried(env)
-
-
-def test_an_exception_in_a_worker_is_printed_by_it_and_ends_the_training(capfd):
-    env = subproc(None, raise_error)
-    with pytest.raises(RuntimeError, match=r"at environment step 28: .* worker 1 .* ended with exit code 1\."):
-        CGP("MlpPolicy", VecNormalize(env), **SMALL).learn(300)
-    assert "ZeroDivisionError: the simulator is unstable" in capfd.readouterr().err
-    assert_buried(env)
-
-
-def test_a_worker_that_dies_during_a_gradient_step_is_named():
-    env = subproc(None, None)
-    model = CGP("MlpPolicy", env, **SMALL)
-    with pytest.raises(RuntimeError, match=r"worker 1 .* was killed by signal 15"):
-        model.learn(300, Do(20, env.processes[1].terminate))
-    assert_buried(env)
-
-
-def test_a_worker_that_dies_in_a_nested_training_is_named_alone():
-    env = subproc(None, None, None)
-    outer, inner = (CGP("MlpPolicy", env, **SMALL) for _ in range(2))
-    message = r"of 3 workers, worker 1 \(process \d+\) was killed by signal 15 \(Terminated\)\. An"
-    with pytest.raises(RuntimeError, match=message):
-        outer.learn(300, Do(20, lambda: inner.learn(300, Do(20, env.processes[1].terminate))))
-    assert_buried(env)
-
-
-def test_a_worker_of_an_evaluation_that_dies_is_named():
-    env, eval_env = subproc(None), subproc(kill_worker)
-    with pytest.raises(RuntimeError, match=r"of 1 workers, worker 0 .* was killed by signal 9"):
-        CGP("MlpPolicy", env, **SMALL).learn(300, EvalCallback(eval_env, eval_freq=20, n_eval_episodes=5, verbose=0))
-    # The training's environment has not failed: it goes on, or is closed as usual
-    assert env.processes[0].is_alive()
-    assert not env.closed
-    env.close()
-    assert_buried(eval_env)
-
-
-@pytest.mark.usefixtures("heeds_interruptions")
-def test_an_interruption_from_the_keyboard_that_ends_workers_leaves_an_environment_that_closes():
-    env = subproc(None, None)
-
-    def interrupt():
-        # As a terminal does, for every process in it
-        for process in env.processes:
-            os.kill(process.pid, signal.SIGINT)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        CGP("MlpPolicy", env, **SMALL).learn(300, Do(20, interrupt))
-    assert_buried(env)
 
 
 @pytest.mark.parametrize("vec_env", [DummyVecEnv, None], ids=["vectorised", "single"])
@@ -329,106 +173,6 @@ def test_bounds_are_compared_in_the_data_type_of_the_space():
         BoundsWatch(box)(Transition(3, box, np.array([[0.7]]), None, [], 1))
     with pytest.warns(UserWarning, match="outside of its observation space"):
         BoundsWatch(box)(Transition(3, box, np.array([[0.71]]), None, [], 1))
-
-
-def learn(folder, fault=None, at=73, model=None, function=None):
-    """Train for 150 steps, the state saved after every 20, with a fault of the environment or of the process."""
-    model = CGP("MlpPolicy", Failing(fault, at), **SMALL, seed=0) if model is None else model
-    return model.learn(150, [TrainingCheckpointCallback(20, folder), Do(at if function else None, function)])
-
-
-def assert_resumes(folder, step, expected):
-    """The newest state is that of a step, and the training goes on to the end that it would have had."""
-    assert max(StateStore(folder).steps()) == step
-    model = learn(folder, model=CGP.resume(folder, Failing()))
-    assert model.num_timesteps == 150
-    for name, parameter in expected.policy.state_dict().items():
-        np.testing.assert_array_equal(model.policy.state_dict()[name].numpy(), parameter.numpy(), err_msg=name)
-
-
-def test_the_last_state_resumes_after_an_environment_has_raised(tmp_path):
-    with pytest.raises(ZeroDivisionError, match=r"^the simulator is unstable$"):
-        learn(tmp_path / "failed", raise_error)
-    assert_resumes(tmp_path / "failed", 60, learn(tmp_path / "straight"))
-
-
-@pytest.mark.parametrize("fault", [with_observation(np.full(3, np.nan)), with_observation(np.ones(1)), with_reward(None)])
-def test_the_last_state_resumes_after_a_value_was_refused(fault, tmp_path):
-    with pytest.raises(ValueError, match="The environment returned"):
-        learn(tmp_path / "failed", fault)
-    assert_resumes(tmp_path / "failed", 60, learn(tmp_path / "straight"))
-
-
-# A state is a file of arrays, and one that names it
-@pytest.mark.parametrize(("n_written", "last"), [(0, 60), (1, 60), (2, 80)])
-def test_the_older_state_resumes_after_the_disk_was_full(n_written, last, tmp_path, monkeypatch):
-    folder, expected = tmp_path / "failed", learn(tmp_path / "straight")
-    written, fsync = [], os.fsync
-
-    def fill(descriptor):
-        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
-            return
-        written.append(descriptor)
-        if len(written) > n_written:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        fsync(descriptor)
-
-    with pytest.raises(OSError, match=r"No space left on device.*: '.*failed/.*'") as caught:
-        learn(folder, at=61, function=lambda: monkeypatch.setattr("os.fsync", fill))
-    assert caught.value.errno == errno.ENOSPC
-    assert Path(caught.value.filename).is_relative_to(folder)
-    assert not [path for path in folder.rglob("*") if "partial" in path.name]
-    monkeypatch.setattr("os.fsync", fsync)
-    assert_resumes(folder, last, expected)
-
-
-def test_sigterm_saves_the_state_and_ends_the_process(tmp_path):
-    handler = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(SystemExit) as caught:
-        learn(tmp_path / "stopped", function=lambda: os.kill(os.getpid(), signal.SIGTERM))
-    assert caught.value.code == 143
-    assert signal.getsignal(signal.SIGTERM) is handler
-    assert_resumes(tmp_path / "stopped", 73, learn(tmp_path / "straight"))
-
-
-@pytest.mark.usefixtures("heeds_interruptions")
-def test_ctrl_c_saves_the_state_and_is_raised_by_learn(tmp_path, capfd):
-    handler = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt, match=r"its state of step 73 is in .*stopped; `resume` continues it"):
-        learn(tmp_path / "stopped", function=lambda: signal.raise_signal(signal.SIGINT))
-    assert "saves its state and stops when this rollout is over. Press Ctrl-C again to stop at once" in capfd.readouterr().err
-    assert signal.getsignal(signal.SIGINT) is handler
-    assert_resumes(tmp_path / "stopped", 73, learn(tmp_path / "straight"))
-
-
-@pytest.mark.usefixtures("heeds_interruptions")
-def test_an_error_after_ctrl_c_is_not_hidden(tmp_path, monkeypatch):
-    def fill_disk(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    def interrupt():
-        monkeypatch.setattr(StateStore, "save", fill_disk)
-        signal.raise_signal(signal.SIGINT)
-
-    with pytest.raises(OSError, match="No space left"):
-        learn(tmp_path, function=interrupt)
-
-
-@pytest.mark.usefixtures("heeds_interruptions")
-@pytest.mark.parametrize("wrapper", [RestorableEnv, Monitor])
-def test_ctrl_c_that_ends_workers_too_keeps_the_last_state(wrapper, tmp_path):
-    env = SubprocVecEnv([lambda: wrapper(Failing())] * 2, start_method="fork")
-
-    def interrupt():
-        for process in env.processes:
-            os.kill(process.pid, signal.SIGINT)
-            process.join(30)
-        signal.raise_signal(signal.SIGINT)
-
-    with pytest.raises(KeyboardInterrupt, match="its state of step 20 is in"):
-        CGP("MlpPolicy", env, **SMALL).learn(300, [TrainingCheckpointCallback(20, tmp_path), Do(15, interrupt)])
-    assert StateStore(tmp_path).load()[0] == 20
-    assert_buried(env)
 
 
 def test_every_fault_in_the_documentation_has_its_test():
