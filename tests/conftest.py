@@ -70,6 +70,12 @@ def heeds_interruptions():
 
 
 @pytest.fixture
+def in_tmp_path(monkeypatch, tmp_path):
+    """Work in the test's own folder, where default and relative paths then lie."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
 def short_policy_training(monkeypatch):
     """Rounds of 10 steps, so that offline training takes a moment."""
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)

@@ -106,6 +106,7 @@ def missing(callback, folder, steps=60, **arguments):
     return [str(each.message) for each in warned if "was among the callbacks, and is not now" in str(each.message)]
 
 
+@pytest.mark.usefixtures("in_tmp_path")
 @pytest.mark.parametrize(
     "callback",
     [

@@ -76,6 +76,7 @@ def test_only_code_with_arguments_of_its_own_is_shown(arguments, imports, sectio
     assert rest.partition("```py\n")[2].partition("\n```")[0].splitlines() == (section or [])
 
 
+@pytest.mark.usefixtures("in_tmp_path")
 def test_the_page_of_the_documentation_is_that_of_the_records():
     root = Path(__file__).parent.parent
     records = [json.loads(path.read_text()) for path in (root / "benchmark/results/environments").glob("*.json")]

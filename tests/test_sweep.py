@@ -15,6 +15,8 @@ from benchmark.sweeps.execution import describe
 from benchmark.sweeps.experiments import load_sweep, study_name
 from benchmark.sweeps.storages import open_storage
 
+pytestmark = pytest.mark.usefixtures("in_tmp_path")
+
 
 def test_options_replace_what_the_file_says(tmp_path):
     sweep, args = of_command_line(
@@ -109,7 +111,6 @@ def test_the_papers_sweeps_have_values_that_their_methods_take(name):
 
 
 def test_checked_values_need_neither_memory_nor_files(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
     sizes = []
     monkeypatch.setattr("stable_baselines3.TD3._setup_model", lambda self: sizes.append(self.buffer_size))
     for changes in (method("td3", buffer_size=10**12), method("td3"), method("td3", buffer_size=50)):

@@ -19,6 +19,8 @@ from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import KEY
 from benchmark.sweeps.validation import SweepError
 
+pytestmark = pytest.mark.usefixtures("in_tmp_path")
+
 
 @pytest.fixture
 def ledger(tmp_path):
