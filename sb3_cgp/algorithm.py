@@ -102,7 +102,7 @@ class CGP(
         ``target_update_interval`` gradient steps
     :param target_policy_noise: Standard deviation of Gaussian noise added to target actions (smoothing noise)
     :param target_noise_clip: Limit for absolute value of target policy smoothing noise.
-    :param diagnostics: whether to log diagnostics of the policy every 100 gradient steps, at the cost of a run of CEM
+    :param diagnostics: whether to log diagnostics of the policy; every 100 gradient steps this costs one more CEM call
     :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
         the reported success rate, mean episode length, and mean reward over
     :param tensorboard_log: the log location for tensorboard (if None, no logging)

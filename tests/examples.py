@@ -2,8 +2,10 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+from stable_baselines3.common.callbacks import EvalCallback
 
 from sb3_cgp import CGP
 
@@ -24,7 +26,7 @@ def shortened(monkeypatch: pytest.MonkeyPatch) -> None:
 
     What is shortened are the numbers alone: arguments are checked as they are.
     """
-    learn, construct = CGP.learn, CGP.__init__
+    learn, construct, construct_evaluation = CGP.learn, CGP.__init__, EvalCallback.__init__
 
     def construct_short(self: CGP, *args: object, **kwargs: object) -> None:
         construct(self, *args, **kwargs)
@@ -33,7 +35,12 @@ def shortened(monkeypatch: pytest.MonkeyPatch) -> None:
     def learn_short(self: CGP, total_timesteps: int, *args: object, **kwargs: object) -> CGP:
         return learn(self, min(total_timesteps, STEPS), *args, **kwargs)
 
+    def construct_frequent(self: EvalCallback, *args: Any, **kwargs: Any) -> None:
+        construct_evaluation(self, *args, **kwargs)
+        self.eval_freq = min(self.eval_freq, STEPS // 2)
+
     monkeypatch.setattr(CGP, "__init__", construct_short)
+    monkeypatch.setattr(EvalCallback, "__init__", construct_frequent)
     monkeypatch.setattr(CGP, "learn", learn_short)
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 2)
 
