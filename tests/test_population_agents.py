@@ -1,6 +1,7 @@
 """A population's agents as ordinary models: they predict, are saved and exported, and train on."""
 
 import functools
+import warnings
 
 import numpy as np
 import pytest
@@ -60,6 +61,16 @@ def test_agents_act_learn_and_export_with_actions_of_several_axes(tmp_path):
         agent.export(tmp_path / f"{index}")
         exported, _ = CGP.load_weights(tmp_path / f"{index}").predict(observations[index])
         np.testing.assert_allclose(exported, agent.predict(observations[index])[0], atol=1e-5)
+
+
+def test_a_copy_of_an_agent_whose_actor_is_not_due_yet_warns_of_nothing():
+    population = make(2, policy_delay=50).learn(2 * 28)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        agent = population[1]
+    assert agent._n_updates == agent._loss_watch._step.item() == 8
+    assert agent.critic.optimizer.state
+    assert not agent.actor.optimizer.state
 
 
 def test_a_copy_of_an_agent_changes_neither_the_population_nor_its_random_numbers():

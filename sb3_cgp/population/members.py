@@ -102,10 +102,11 @@ class PopulationMembers(OverlappedTraining):
         spaces = self.observation_space, self.action_space
         with preserved_random_state(self.device):
             agent = make_agent(self.policy_class, self.agents[index], *spaces, self.device)  # type: ignore[arg-type]
+        # First: to a model that has not learnt, trained critics without a trained actor would be somebody else's
+        agent._n_updates = int(self._agent_updates[index])
         self.policy.copy_to(agent, index)
         agent.policy.selector = self.policy.selector
         agent.num_timesteps = self.num_timesteps // len(self)
-        agent._n_updates = int(self._agent_updates[index])
         agent._current_progress_remaining = self._current_progress_remaining
         is_online = self._trains_online and agent._n_updates >= agent.policy_delay
         agent._policy_is_trained = is_online or bool(self._policies_trained[index])
