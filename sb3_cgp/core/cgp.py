@@ -6,16 +6,17 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import configure_logger, update_learning_rate
+from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.td3.policies import Actor
 from torch.nn import functional as F
 
-from sb3_cgp.common.callback_locals import learn_locals, rollout_locals, with_progress_bar
 from sb3_cgp.common.networks import update_average
+from sb3_cgp.common.offline_training import rollout_locals, start_training
 from sb3_cgp.common.rules import require, require_count
 from sb3_cgp.common.sb3_arguments import as_schedule
 from sb3_cgp.core import offline
@@ -273,50 +274,14 @@ class CGP(OffPolicyAlgorithm):
 
         The parameters and the convergence rule are described at :meth:`sb3_cgp.CGP.train_policy`.
         """
-        require_count("max_steps", max_steps)
-        allowed = f"one of {', '.join(map(repr, POLICY_LOSSES))} to train a policy"
-        require(self.policy_loss is not None, "policy_loss", self.policy_loss, allowed)
-        allowed = "False to train a policy apart: a shared extractor would change the critics"
-        require(not self.policy.share_features_extractor, "share_features_extractor", True, allowed)
-        buffer, batch_size = self.replay_buffer, self.batch_size if batch_size is None else batch_size
-        require_count("batch_size", batch_size)
-        is_filled = buffer is not None and buffer.size() > 0
-        require(is_filled, "replay_buffer", buffer, "filled, by `learn` or `load_replay_buffer`")
-        assert buffer is not None and self.policy_loss is not None  # noqa: PT018
-        if not hasattr(self, "_logger"):
-            # No `learn` has configured it, as in a loaded model
-            self._logger = configure_logger(self.verbose, self.tensorboard_log, "CGP", reset_num_timesteps=False)
-
-        plateau, losses, is_trained = offline.Plateau(), [], self._policy_is_trained
+        batch_size = self.batch_size if batch_size is None else batch_size
+        self._check_policy_training(max_steps, batch_size)
+        is_trained = self._policy_is_trained
         # Callbacks evaluate and save the actor that is being trained
         self._mark_policy(is_trained=True, is_due=self._policy_is_due)
         try:
-            callback = self._init_callback(callback)
-            callback = with_progress_bar(callback) if progress_bar else callback
-            callback.on_training_start(learn_locals(self, callback, max_steps, progress_bar), globals())
-            for n_steps in range(1, max_steps + 1):
-                # Callbacks may have evaluated the policy. Batch norm of the critics keeps its statistics.
-                self.policy.set_training_mode(True)
-                self.critic.set_training_mode(False)
-                self._update_learning_rates(1.0 - (n_steps - 1) / max_steps, "actor")
-                observations = buffer.sample(batch_size, env=self._vec_normalize_env).observations
-                loss = POLICY_LOSSES[self.policy_loss](self.policy, observations)
-                self._descend("actor", loss)
-                losses.append(loss.detach())
-                if n_steps % self.target_update_interval == 0:
-                    update_average(self.actor, self.actor_target, self.tau)
-                callback.update_locals(rollout_locals(self, callback))
-                if is_stopped := not callback.on_step():
-                    break
-                if n_steps % offline.ROUND == 0:
-                    self._record_round(losses)
-                    # The log's axis continues after the environment steps
-                    self.logger.dump(self.num_timesteps + n_steps)
-                    if plateau.reached(th.stack(losses).mean().item()):
-                        break
-                    losses = []
-            else:
-                warnings.warn(f"The policy's loss has not reached a plateau in max_steps={max_steps} steps.", stacklevel=2)
+            callback = start_training(self, callback, max_steps, progress_bar)
+            n_steps, is_stopped = self._descend_to_plateau(max_steps, batch_size, callback)
             # An actor that a callback stopped within its first round is of no use
             is_trained = is_trained or n_steps >= min(offline.ROUND, max_steps)
             if is_stopped:
@@ -329,6 +294,45 @@ class CGP(OffPolicyAlgorithm):
         if self.verbose >= 1:
             print(f"The policy was trained for {n_steps} gradient steps")
         return self
+
+    def _check_policy_training(self, max_steps: int, batch_size: int) -> None:
+        require_count("max_steps", max_steps)
+        allowed = f"one of {', '.join(map(repr, POLICY_LOSSES))} to train a policy"
+        require(self.policy_loss is not None, "policy_loss", self.policy_loss, allowed)
+        allowed = "False to train a policy apart: a shared extractor would change the critics"
+        require(not self.policy.share_features_extractor, "share_features_extractor", True, allowed)
+        require_count("batch_size", batch_size)
+        is_filled = self.replay_buffer is not None and self.replay_buffer.size() > 0
+        require(is_filled, "replay_buffer", self.replay_buffer, "filled, by `learn` or `load_replay_buffer`")
+
+    def _descend_to_plateau(self, max_steps: int, batch_size: int, callback: BaseCallback) -> tuple[int, bool]:
+        """Train the actor until its loss no longer falls; return the number of steps, and whether a callback stopped it."""
+        assert self.replay_buffer is not None and self.policy_loss is not None  # noqa: PT018
+        losses, means = [], []
+        for n_steps in range(1, max_steps + 1):
+            # Callbacks may have evaluated the policy. Batch norm of the critics keeps its statistics.
+            self.policy.set_training_mode(True)
+            self.critic.set_training_mode(False)
+            self._update_learning_rates(1.0 - (n_steps - 1) / max_steps, "actor")
+            observations = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env).observations
+            loss = POLICY_LOSSES[self.policy_loss](self.policy, observations)
+            self._descend("actor", loss)
+            losses.append(loss.detach())
+            if n_steps % self.target_update_interval == 0:
+                update_average(self.actor, self.actor_target, self.tau)
+            callback.update_locals(rollout_locals(self, callback))
+            if not callback.on_step():
+                return n_steps, True
+            if n_steps % offline.ROUND == 0:
+                self._record_round(losses)
+                # The log's axis continues after the environment steps
+                self.logger.dump(self.num_timesteps + n_steps)
+                means.append(th.stack(losses).mean().item())
+                if offline.has_plateaued(means):
+                    return n_steps, False
+                losses = []
+        warnings.warn(f"The policy's loss has not reached a plateau in max_steps={max_steps} steps.", stacklevel=3)
+        return max_steps, False
 
     def _record_round(self, losses: list[th.Tensor]) -> None:
         """Log the mean loss of a round of offline training."""

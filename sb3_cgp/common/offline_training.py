@@ -1,5 +1,6 @@
 """
-What SB3's callbacks see of a training in which no environment moves: the local variables of SB3's loop, and a progress bar.
+The beginning of a training in which no environment moves, and what SB3's callbacks see of it: the local variables of SB3's
+loop, and a progress bar.
 
 SB3 passes ``locals()`` of ``learn`` and of ``collect_rollouts`` to callbacks, so that these names are part of its interface.
 """
@@ -9,18 +10,32 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.utils import configure_logger
 
 
-def learn_locals(model: OffPolicyAlgorithm, callback: BaseCallback, max_steps: int, progress_bar: bool) -> dict[str, Any]:
+def start_training(model: OffPolicyAlgorithm, callback: MaybeCallback, max_steps: int, progress_bar: bool) -> BaseCallback:
     """
-    Return the local variables of ``learn`` for a training of ``max_steps`` steps.
+    Begin a training as SB3's ``learn`` does: with a logger, callbacks, and a progress bar if one is displayed.
 
     :param model: the model
     :param callback: the callbacks
-    :param max_steps: number of calls of ``on_step``
+    :param max_steps: largest number of calls of ``on_step``
     :param progress_bar: whether a progress bar is displayed
-    :return: the local variables by name
+    :return: the callbacks, initialised, and told that the training begins
+    :raises ImportError: if a progress bar needs a package that is not installed, tqdm or rich
     """
+    if not hasattr(model, "_logger"):
+        # No `learn` has configured it, as in a loaded model
+        model._logger = configure_logger(model.verbose, model.tensorboard_log, "CGP", reset_num_timesteps=False)
+    callback = model._init_callback(callback)
+    callback = _with_progress_bar(callback) if progress_bar else callback
+    callback.on_training_start(_learn_locals(model, callback, max_steps, progress_bar), globals())
+    return callback
+
+
+def _learn_locals(model: OffPolicyAlgorithm, callback: BaseCallback, max_steps: int, progress_bar: bool) -> dict[str, Any]:
+    """Return the local variables of ``learn``, by name, for a training of ``max_steps`` steps."""
     return {
         "self": model,
         "total_timesteps": model.num_timesteps + max_steps * model.n_envs,
@@ -73,14 +88,8 @@ class _ProgressBar(ProgressBarCallback):
         return True
 
 
-def with_progress_bar(callback: BaseCallback) -> BaseCallback:
-    """
-    Add a progress bar to the callbacks of a training.
-
-    :param callback: the callbacks, initialised
-    :return: the callbacks and the progress bar, initialised
-    :raises ImportError: if tqdm or rich is not installed
-    """
+def _with_progress_bar(callback: BaseCallback) -> BaseCallback:
+    """Add a progress bar to initialised callbacks."""
     progress_bar = _ProgressBar()
     progress_bar.init_callback(callback.model)
     callbacks = CallbackList([callback, progress_bar])
