@@ -35,7 +35,7 @@ class CGP(
     ResumableAlgorithm,
     GuardedAlgorithm,
     DiagnosticsAlgorithm,
-    # Records `train` and `_descend` of the classes below it
+    # Records the gradient step of the classes below it
     CudaGraphAlgorithm,
     LossGuard,
     LeanReplayAlgorithm,

@@ -54,7 +54,7 @@ class StandIn:
         for recorded, new in zip(self.inputs, inputs, strict=True):
             if recorded is not None:
                 recorded.copy_(new)
-        model = getattr(self.function, "__self__", None)
+        model = getattr(getattr(self.function, "func", None), "__self__", None)
         attributes = {} if model is None else dict(vars(model))
         outputs = cuda_graphs.clone_all(self.function(*self.inputs))
         if model is not None:

@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.td3.policies import Actor
 from torch.nn import functional as F
@@ -187,43 +187,49 @@ class CGP(OffPolicyAlgorithm):
         for _ in range(gradient_steps):
             self._n_updates += 1
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            # For n-step replay, discount factor is gamma**n_steps (when no early termination)
-            discounts = batch.discounts if batch.discounts is not None else self.gamma
-
-            with th.no_grad():
-                # Select next actions by CEM on the first target critic
-                next_actions = self.policy.select_actions(batch.next_observations, self.critic_target).actions
-                # Smooth them by clipped noise, as TD3 does
-                noise = th.empty_like(next_actions).normal_(0, self.target_policy_noise)
-                noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
-                next_actions = (next_actions + noise).clamp(-1, 1)
-                # Compute the target q*: min over all target critics
-                next_q_values = th.cat(self.critic_target(batch.next_observations, next_actions), dim=1)
-                next_q_values = next_q_values.min(dim=1, keepdim=True).values
-                target_q_values = batch.rewards + (1 - batch.dones) * discounts * next_q_values
-
-            # Update the critics
-            current_q_values = self.critic(batch.observations, batch.actions)
-            critic_loss = th.stack([F.mse_loss(q_values, target_q_values) for q_values in current_q_values]).sum()
-            self._descend("critic", critic_loss)
-            values["critic_loss"].append(critic_loss.detach())
-            values["q_value"].append(current_q_values[0].detach().mean())
-
-            # Update the policy: as in TD3, its loss sees the updated critic
-            if self._trains_online and self._n_updates % self.policy_delay == 0:
-                assert self.policy_loss is not None
-                actor_loss = POLICY_LOSSES[self.policy_loss](self.policy, batch.observations)
-                self._descend("actor", actor_loss)
+            trains_actor = self._trains_online and self._n_updates % self.policy_delay == 0
+            moves_averages = self._n_updates % self.target_update_interval == 0
+            for name, value in self._gradient_step(batch, trains_actor, moves_averages).items():
+                values[name].append(value)
+            if trains_actor:
                 self._mark_policy(is_trained=True)
-                values["actor_loss"].append(actor_loss.detach())
-
-            # Update the target critics and the averaged actor, every second step by default (Appendix B)
-            if self._n_updates % self.target_update_interval == 0:
-                update_average(self.critic, self.critic_target, self.tau)
-                update_average(self.actor, self.actor_target, self.tau)
-
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._record_means(values)
+
+    def _gradient_step(self, batch: ReplayBufferSamples, trains_actor: bool, moves_averages: bool) -> dict[str, th.Tensor]:
+        """Update the critics on a minibatch, and the actor and the averages if they are due. Return what is to be logged."""
+        # For n-step replay, discount factor is gamma**n_steps (when no early termination)
+        discounts = batch.discounts if batch.discounts is not None else self.gamma
+        with th.no_grad():
+            # Select next actions by CEM on the first target critic
+            next_actions = self.policy.select_actions(batch.next_observations, self.critic_target).actions
+            # Smooth them by clipped noise, as TD3 does
+            noise = th.empty_like(next_actions).normal_(0, self.target_policy_noise)
+            noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
+            next_actions = (next_actions + noise).clamp(-1, 1)
+            # Compute the target q*: min over all target critics
+            next_q_values = th.cat(self.critic_target(batch.next_observations, next_actions), dim=1)
+            next_q_values = next_q_values.min(dim=1, keepdim=True).values
+            target_q_values = batch.rewards + (1 - batch.dones) * discounts * next_q_values
+
+        # Update the critics
+        current_q_values = self.critic(batch.observations, batch.actions)
+        critic_loss = th.stack([F.mse_loss(q_values, target_q_values) for q_values in current_q_values]).sum()
+        self._descend("critic", critic_loss)
+        values = {"critic_loss": critic_loss.detach(), "q_value": current_q_values[0].detach().mean()}
+
+        # Update the policy: as in TD3, its loss sees the updated critic
+        if trains_actor:
+            assert self.policy_loss is not None
+            actor_loss = POLICY_LOSSES[self.policy_loss](self.policy, batch.observations)
+            self._descend("actor", actor_loss)
+            values["actor_loss"] = actor_loss.detach()
+
+        # Update the target critics and the averaged actor, every second step by default (Appendix B)
+        if moves_averages:
+            update_average(self.critic, self.critic_target, self.tau)
+            update_average(self.actor, self.actor_target, self.tau)
+        return values
 
     def _update_learning_rates(self, progress_remaining: float, *names: str) -> None:
         """Set the learning rates of the "critic" or the "actor" by their schedules."""

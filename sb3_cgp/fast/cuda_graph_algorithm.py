@@ -1,6 +1,6 @@
 """CGP whose gradient steps, and whose acting by CEM, are CUDA graphs on a GPU."""
 
-from collections import defaultdict
+import functools
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,33 +24,18 @@ TRANSIENT = (
     "_recorded_settings",
     "_loss_watch",
     "_unlogged",
-    "_step_losses",
+    "_watches_losses",
 )
-
-
-class _OneBatch:
-    """
-    A replay buffer whose every sample is one given minibatch.
-
-    :param batch: the minibatch
-    """
-
-    def __init__(self, batch: ReplayBufferSamples):
-        self._batch = batch
-
-    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
-        """Return the minibatch."""
-        return self._batch
 
 
 class CudaGraphAlgorithm(CGP):
     """
     CGP whose gradient steps are recorded as CUDA graphs on a GPU, and replayed.
 
-    The recorded function is the core's ``train`` itself, for one gradient step on a minibatch that was sampled before. Its
-    losses are read when the log is written, as the host would synchronise with the GPU at every step otherwise; a NaN or
-    infinite loss lets the optimizer skip the step, and is reported at that time. Without a GPU, and with ``Dict``
-    observations or another optimizer than a fused Adam, steps are carried out as usual.
+    The recorded function is the core's gradient step itself, on a minibatch that was sampled before. Its losses are read when
+    the log is written, as the host would synchronise with the GPU at every step otherwise; a NaN or infinite loss lets the
+    optimizer skip the step, and is reported at that time. Without a GPU, and with ``Dict`` observations or another optimizer
+    than a fused Adam, steps are carried out as usual.
     """
 
     # The argument of the constructor
@@ -81,8 +66,8 @@ class CudaGraphAlgorithm(CGP):
         self._recorded_settings: tuple[Any, ...] = ()
         self._loss_watch = LossWatch(("critic", "actor"), self._n_updates, self.device)
         self._unlogged: dict[str, list[th.Tensor]] = {}
-        # The losses of the step that is carried out, within `_carry_out`
-        self._step_losses: dict[str, list[th.Tensor]] | None = None
+        # Whether losses are watched on the device, as within `_carry_out`
+        self._watches_losses = False
 
     def set_parameters(
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
@@ -108,45 +93,27 @@ class CudaGraphAlgorithm(CGP):
         :param batch_size: number of transitions in a minibatch
         :raises ValueError: if a loss was NaN or infinite
         """
-        if not self._records_steps:
-            super().train(gradient_steps, batch_size)
-            return
-        assert self.replay_buffer is not None
-        self.policy.set_training_mode(True)
-        self._update_learning_rates(self._current_progress_remaining, "critic", "actor")
-        # This mark, and that below, are the core's `train`'s, which no replay sets
-        self._mark_policy(self._policy_is_trained and self._trains_online, is_due=self.policy_training == "offline")
-        losses, n_updates_before = defaultdict(list), self._n_updates
-        for _ in range(gradient_steps):
-            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            n_updates = self._n_updates + 1
-            trains_actor = self._trains_online and n_updates % self.policy_delay == 0
-            moves_averages = n_updates % self.target_update_interval == 0
-            results = self._recorded_function((trains_actor, moves_averages))(self._carry_out, *batch)
-            self._n_updates = n_updates
-            for name, loss in zip(LOSSES, results, strict=True):
-                if loss is not None:
-                    losses[name].append(loss)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self._unlogged.update(losses)
-        if "actor_loss" in losses:
-            self._mark_policy(is_trained=True)
-        if self._n_updates // CHECK_INTERVAL > n_updates_before // CHECK_INTERVAL:
+        n_updates_before = self._n_updates
+        super().train(gradient_steps, batch_size)
+        if self._records_steps and self._n_updates // CHECK_INTERVAL > n_updates_before // CHECK_INTERVAL:
             self._loss_watch.check()
 
-    def _carry_out(self, *fields: th.Tensor) -> Tensors:
-        """Run the core's ``train`` for one gradient step on a minibatch, and return its losses."""
+    def _gradient_step(self, batch: ReplayBufferSamples, trains_actor: bool, moves_averages: bool) -> dict[str, th.Tensor]:
+        if not self._records_steps:
+            return super()._gradient_step(batch, trains_actor, moves_averages)
+        due = (trains_actor, moves_averages)
+        results = self._recorded_function(due)(functools.partial(self._carry_out, due), *batch)
+        return {name: loss for name, loss in zip(LOSSES, results, strict=True) if loss is not None}
+
+    def _carry_out(self, due: tuple[bool, bool], *fields: th.Tensor) -> Tensors:
+        """Carry the core's gradient step out on a minibatch, and return its losses."""
         self._loss_watch.begin_step()
-        # The core's `train` samples a batch and counts the step. The caller does both, as replaying a graph runs no Python.
-        usual = self.replay_buffer, self._n_updates
-        self.replay_buffer = _OneBatch(ReplayBufferSamples(*fields))  # type: ignore[assignment]
-        losses = self._step_losses = {}
+        self._watches_losses = True
         try:
-            super().train(1)
+            losses = super()._gradient_step(ReplayBufferSamples(*fields), *due)
         finally:
-            self.replay_buffer, self._n_updates = usual
-            self._step_losses = None
-        return tuple(losses[name][0] if name in losses else None for name in LOSSES)
+            self._watches_losses = False
+        return tuple(losses.get(name) for name in LOSSES)
 
     def _recorded_function(self, due: tuple[bool, bool] | None) -> RecordedFunction:
         """Return the recorded function of a gradient step or of acting; a new one if a setting has changed."""
@@ -201,9 +168,6 @@ class CudaGraphAlgorithm(CGP):
         )
 
     def _update_learning_rates(self, progress_remaining: float, *names: str) -> None:
-        if self._step_losses is not None:
-            # Within a step, which would record the present rates: the host has set them before
-            return
         super()._update_learning_rates(progress_remaining, *names)
         for name in self._recorded_rates.keys() & set(names):
             for group in getattr(self, name).optimizer.param_groups:
@@ -213,7 +177,7 @@ class CudaGraphAlgorithm(CGP):
 
     def _descend(self, name: str, loss: th.Tensor) -> None:
         optimizer = getattr(self, name).optimizer
-        if self._step_losses is None:
+        if not self._watches_losses:
             # Not recorded, as in the policy's offline training
             skip_step_if(optimizer, None)
             super()._descend(name, loss)
@@ -224,11 +188,15 @@ class CudaGraphAlgorithm(CGP):
             CGP._descend(self, name, loss)
 
     def _record_means(self, values: dict[str, list[th.Tensor]]) -> None:
-        if self._step_losses is not None:
-            self._step_losses.update(values)
-            return
+        if self._records_steps:
+            # Until the log is written
+            self._unlogged.update(values)
+        else:
+            super()._record_means(values)
+
+    def _record_round(self, losses: list[th.Tensor]) -> None:
+        super()._record_round(losses)
         self._report()
-        super()._record_means(values)
 
     def _report(self) -> None:
         """
