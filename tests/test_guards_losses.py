@@ -13,13 +13,11 @@ class Descending(TD3):
 
     n_steps_down = 0
 
-    def _descend(self, name, loss):
-        self.n_steps_down += 1
-
     def train(self, gradient_steps, batch_size=100):
         for loss in self.losses:
             self._n_updates += 1
-            self._descend("critic", th.tensor(loss, requires_grad=True))
+            self._check_loss("critic", th.tensor(loss, requires_grad=True))
+            self.n_steps_down += 1
 
 
 class Guarded(LossGuard, Descending):

@@ -241,10 +241,16 @@ class CGP(OffPolicyAlgorithm):
 
     def _descend(self, name: str, loss: th.Tensor) -> None:
         """Take one step of the optimizer of the "critic" or the "actor" down a loss."""
-        optimizer = getattr(self, name).optimizer
-        optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
+        self._check_loss(name, loss)
+        # The user may have frozen the actor, by `requires_grad_(False)`; TD3's loss of the actor has a gradient even so
+        if loss.requires_grad or name != "actor":
+            optimizer = getattr(self, name).optimizer
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimizer.step()
+
+    def _check_loss(self, name: str, loss: th.Tensor) -> None:
+        """Do what is to be done before an optimizer step; subclasses override this."""
 
     def _record_means(self, values: dict[str, list[th.Tensor]]) -> None:
         """Log the means of scalars over gradient steps, given by their keys in the log without "train/"."""
@@ -282,20 +288,19 @@ class CGP(OffPolicyAlgorithm):
         """
         batch_size = self.batch_size if batch_size is None else batch_size
         self._check_policy_training(max_steps, batch_size)
-        is_trained = self._policy_is_trained
+        is_trained, is_due = self._policy_is_trained, self._policy_is_due
         # Callbacks evaluate and save the actor that is being trained
-        self._mark_policy(is_trained=True, is_due=self._policy_is_due)
+        self._mark_policy(is_trained=True, is_due=is_due)
         try:
             callback = start_training(self, callback, max_steps, progress_bar)
-            n_steps, is_stopped = self._descend_to_plateau(max_steps, batch_size, callback)
+            n_steps, is_due = self._descend_to_plateau(max_steps, batch_size, callback)
             # An actor that a callback stopped within its first round is of no use
             is_trained = is_trained or n_steps >= min(offline.ROUND, max_steps)
-            if is_stopped:
+            if is_due:
                 acts = "the actor" if is_trained else "CEM"
                 warnings.warn(f"A callback stopped the policy's training after {n_steps} steps: {acts} acts.", stacklevel=2)
-            self._policy_is_due = is_stopped
         finally:
-            self._mark_policy(is_trained, self._policy_is_due)
+            self._mark_policy(is_trained, is_due)
         callback.on_training_end()
         if self.verbose >= 1:
             print(f"The policy was trained for {n_steps} gradient steps")

@@ -175,17 +175,15 @@ class CudaGraphAlgorithm(CGP):
                 self._recorded_rates[name].fill_(group["lr"])
                 group["lr"] = self._recorded_rates[name]
 
-    def _descend(self, name: str, loss: th.Tensor) -> None:
+    def _check_loss(self, name: str, loss: th.Tensor) -> None:
         optimizer = getattr(self, name).optimizer
-        if not self._watches_losses:
+        if self._watches_losses:
+            # Not the other checks, which would read the loss on the host
+            skip_step_if(optimizer, self._loss_watch.see(name, loss))
+        else:
             # Not recorded, as in the policy's offline training
             skip_step_if(optimizer, None)
-            super()._descend(name, loss)
-            return
-        skip_step_if(optimizer, self._loss_watch.see(name, loss))
-        if loss.requires_grad or name != "actor":
-            # The core's own: a guard in between would read the loss on the host
-            CGP._descend(self, name, loss)
+            super()._check_loss(name, loss)
 
     def _record_means(self, values: dict[str, list[th.Tensor]]) -> None:
         if self._records_steps:
