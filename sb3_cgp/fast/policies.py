@@ -10,6 +10,7 @@ from stable_baselines3.td3.policies import Actor
 from torch import nn
 
 from sb3_cgp.common.rules import require_choice
+from sb3_cgp.core import policies as core_policies
 from sb3_cgp.core.cem import Score
 from sb3_cgp.fast.cuda_graphs import Function
 from sb3_cgp.fast.mlp import MLP
@@ -110,9 +111,9 @@ class CGPPolicy(policies.CGPPolicy):
 MlpPolicy = CGPPolicy
 
 
-class CnnPolicy(CGPPolicy, policies.CnnPolicy):
+class CnnPolicy(CGPPolicy, core_policies.CnnPolicy):
     """Policy class of CGP for images: :class:`CGPPolicy` with SB3's ``NatureCNN`` as its features extractor."""
 
 
-class MultiInputPolicy(CGPPolicy, policies.MultiInputPolicy):
+class MultiInputPolicy(CGPPolicy, core_policies.MultiInputPolicy):
     """Policy class of CGP for ``Dict`` observations: :class:`CGPPolicy` with SB3's ``CombinedExtractor``."""

@@ -1,4 +1,4 @@
-"""CGP's policies whose actor proposes its action to the selector."""
+"""CGP's policy whose actor proposes its action to the selector."""
 
 from typing import Any
 
@@ -46,11 +46,3 @@ class CGPPolicy(policies.CGPPolicy):
         actor = self.actor_target if critic is self.critic_target else self.actor
         with evaluation_mode(actor):
             return {"proposals": actor(observation).unsqueeze(1)}
-
-
-class CnnPolicy(CGPPolicy, policies.CnnPolicy):
-    """Policy class of CGP for images: :class:`CGPPolicy` with SB3's ``NatureCNN`` as its features extractor."""
-
-
-class MultiInputPolicy(CGPPolicy, policies.MultiInputPolicy):
-    """Policy class of CGP for ``Dict`` observations: :class:`CGPPolicy` with SB3's ``CombinedExtractor``."""
