@@ -13,7 +13,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_cgp import RestorableEnv, TrainingCheckpointCallback
-from sb3_cgp.population import ChunkedSubprocVecEnv, Population, make_environments, make_population_env
+from sb3_cgp.population import ChunkedSubprocVecEnv, Population, make_population_env, processes
 from sb3_cgp.population.processes import chunk_bounds
 from sb3_cgp.resumption.environments import restore_environment
 
@@ -183,7 +183,7 @@ def test_environments_are_shared_out_evenly_and_in_order(n_envs, n_processes):
 def test_one_process_is_a_dummy_vec_env_and_the_cores_are_the_default(monkeypatch, closing):
     assert type(make(n_processes=1)) is DummyVecEnv
     for cores, expected in ((1, DummyVecEnv), (2, ChunkedSubprocVecEnv)):
-        monkeypatch.setattr(make_environments, "available_cores", lambda cores=cores: cores)
+        monkeypatch.setattr(processes, "available_cores", lambda cores=cores: cores)
         env = closing(make(n_processes=None, n_envs=3))
         assert type(env) is expected
         assert len(getattr(env, "processes", [0])) == cores

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, Ve
 from sb3_cgp.common.rules import require
 from sb3_cgp.guards.workers import GRACE, end_workers
 from sb3_cgp.population.environment_worker import step_chunk
-from sb3_cgp.population.processes import available_cores, check_processes, check_start_method, chunk_bounds
+from sb3_cgp.population.processes import choose_processes, chunk_bounds
 
 
 class ChunkedSubprocVecEnv(SubprocVecEnv):
@@ -38,11 +38,8 @@ class ChunkedSubprocVecEnv(SubprocVecEnv):
         # Not SubprocVecEnv's constructor, which starts a process for each environment
         n_envs = len(env_fns)
         require(n_envs > 0, "env_fns", env_fns, "a sequence of at least one function")
-        check_start_method(start_method)
-        n_processes = min(available_cores(), n_envs) if n_processes is None else n_processes
-        check_processes(n_processes, n_envs)
+        self._bounds = chunk_bounds(n_envs, choose_processes(n_processes, n_envs, start_method))
         self.waiting = self.closed = False
-        self._bounds = chunk_bounds(n_envs, n_processes)
         # SB3's choice
         start_method = start_method or ("forkserver" if "forkserver" in mp.get_all_start_methods() else "spawn")
         context: Any = mp.get_context(start_method)

@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cgp.common.rules import require, require_count
 from sb3_cgp.population.environments import ChunkedSubprocVecEnv
-from sb3_cgp.population.processes import available_cores, check_processes, check_start_method
+from sb3_cgp.population.processes import choose_processes
 from sb3_cgp.resumption.environments import RestorableEnv
 
 
@@ -45,10 +45,7 @@ def make_population_env(
         allowed = "left out: `n_processes` chooses the class; SB3's `make_vec_env` makes environments of another one"
         require(name not in kwargs, name, kwargs.get(name), allowed)
     require_count("n_agents", n_agents)
-    check_start_method(start_method)
-    if n_processes is None:
-        n_processes = min(available_cores(), n_agents)
-    check_processes(n_processes, n_agents)
+    n_processes = choose_processes(n_processes, n_agents, start_method)
 
     def wrap(env: gym.Env) -> gym.Env:
         return RestorableEnv(env if wrapper_class is None else wrapper_class(env, **(wrapper_kwargs or {})))

@@ -13,27 +13,23 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def check_processes(n_processes: int, n_envs: int) -> None:
+def choose_processes(n_processes: int | None, n_envs: int, start_method: str | None) -> int:
     """
-    Check a number of processes.
+    Return the number of processes, after a check of it and of how they are to be started.
 
-    :param n_processes: number of processes
+    :param n_processes: number of processes; None for one for each available core, at most one for each environment
     :param n_envs: number of environments
-    :raises ValueError: if it is out of its range
-    """
-    require_count("n_processes", n_processes)
-    require(n_processes <= n_envs, "n_processes", n_processes, f"at most {n_envs}, the number of environments")
-
-
-def check_start_method(start_method: str | None) -> None:
-    """
-    Check how processes are to be started.
-
-    :param start_method: the start method; None for the default
-    :raises ValueError: if this platform does not have it
+    :param start_method: how processes are started; None for the default
+    :return: number of processes
+    :raises ValueError: if the number is out of its range, or this platform does not have the start method
     """
     if start_method is not None:
         require_choice("start_method", start_method, mp.get_all_start_methods())
+    if n_processes is None:
+        return min(available_cores(), n_envs)
+    require_count("n_processes", n_processes)
+    require(n_processes <= n_envs, "n_processes", n_processes, f"at most {n_envs}, the number of environments")
+    return n_processes
 
 
 def chunk_bounds(n_envs: int, n_processes: int) -> list[tuple[int, int]]:
