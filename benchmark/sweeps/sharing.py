@@ -17,7 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from benchmark.sweeps.runs import Run
 from sb3_cgp import CGP
-from sb3_cgp.population.agents import COMMON, OWN, Arguments, check_supported, merge_arguments
+from sb3_cgp.population.arguments import COMMON, OWN, Arguments, check_supported, merge_arguments
 from sb3_cgp.selectors import ActorOnly
 
 # The algorithms whose runs a population can train: CGP, and those that are CGP with these arguments

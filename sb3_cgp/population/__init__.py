@@ -13,7 +13,7 @@ networks                    one network whose parameters have an axis of agents,
 action selector             one call for N B states, with one random generator; the selector is not changed (``policies.py``)
 losses                      one backward pass from their sum: no gradient crosses agents (``gradient_step.py``)
 optimizer                   one step of Adam, with learning rates, step counts and pauses by agent (``adam.py``)
-hyperparameters             numbers become tensors by agent; arguments that change shapes are common (``agents.py``)
+hyperparameters             numbers become tensors by agent; arguments that change shapes are common (``arguments.py``)
 ==========================  ==================================================================================================
 
 An agent pauses in a step where it is not due: before its ``learning_starts``, between its ``policy_delay`` and its

@@ -17,7 +17,7 @@ from sb3_cgp.common.sb3_arguments import as_schedule
 from sb3_cgp.core.policies import CGPPolicy
 from sb3_cgp.guards.names import suggests_names
 from sb3_cgp.guards.observations import innermost
-from sb3_cgp.population.agents import (
+from sb3_cgp.population.arguments import (
     COMMON,
     OWN,
     Arguments,

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_cgp.algorithm import CGP
 from sb3_cgp.common.random_state import preserved_random_state
-from sb3_cgp.population.agents import make_agent
+from sb3_cgp.population.arguments import make_agent
 from sb3_cgp.population.overlap import OverlappedTraining
 from sb3_cgp.population.replay import copied_column
 
@@ -43,12 +43,6 @@ class AgentLogger(Logger):
 
 class PopulationMembers(OverlappedTraining):
     """The part of :class:`~sb3_cgp.population.algorithm.Population` that copies its agents into CGPs, and back."""
-
-    def _choose_inference(self) -> None:
-        """Let ``predict`` use the network that the user chose, or the selector for agents whose actor is not trained."""
-        has_actor = self._policies_trained | self._trains_online
-        self.policy.inference = (self.agents[0].get("inference") or "actor") if has_actor.any() else "cem"
-        self.policy.set_actors(has_actor)
 
     def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto") -> None:
         """

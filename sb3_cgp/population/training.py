@@ -13,7 +13,7 @@ from sb3_cgp.fast.cuda_graphs import RecordedFunction, Tensors, has_cuda_graphs
 from sb3_cgp.fast.recorded_optimizers import CHECK_INTERVAL, LOSSES
 from sb3_cgp.fast.replay import LeanReplayAlgorithm
 from sb3_cgp.guards.algorithm import CommonGuards
-from sb3_cgp.population.agents import Arguments, value_of
+from sb3_cgp.population.arguments import Arguments, value_of
 from sb3_cgp.population.gradient_step import AgentNumbers, GradientStep
 from sb3_cgp.population.policies import PopulationPolicy, SelectFunction
 from sb3_cgp.population.replay import sample_columns
@@ -57,8 +57,10 @@ class PopulationTraining(CommonGuards, LeanReplayAlgorithm):
         return self._policy_loss is not None and not self._trains_online
 
     def _choose_inference(self) -> None:
-        """Let ``predict`` use the actors that are trained: `PopulationMembers` implements it."""
-        raise NotImplementedError
+        """Let ``predict`` use the network that the user chose, or the selector for agents whose actor is not trained."""
+        has_actor = self._policies_trained | self._trains_online
+        self.policy.inference = (self.agents[0].get("inference") or "actor") if has_actor.any() else "cem"
+        self.policy.set_actors(has_actor)
 
     @property
     def failed(self) -> dict[int, str]:

@@ -1,4 +1,4 @@
-"""The agents of a population: the arguments of each, and the ordinary CGP that has them."""
+"""The arguments of a population's agents, and the ordinary CGP that has those of one agent."""
 
 import copy
 import inspect
