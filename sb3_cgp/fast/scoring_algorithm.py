@@ -13,19 +13,20 @@ class ScoringAlgorithm(SelectorAlgorithm):
     # The argument of the constructor
     cem_dtype: str = "auto"
 
-    changeable_arguments: ClassVar[tuple[str, ...]] = (*SelectorAlgorithm.changeable_arguments, "cem_dtype")
+    changeable_arguments: ClassVar[dict[str, str | None]] = {
+        **SelectorAlgorithm.changeable_arguments,
+        "cem_dtype": "_choose_dtype",
+    }
 
     def _setup_model(self) -> None:
         given = self.policy_kwargs.get("cem_dtype")
         require(given is None, "policy_kwargs['cem_dtype']", given, "given as `cem_dtype`, outside `policy_kwargs`")
         super()._setup_model()
-        self._follow_argument("cem_dtype")
+        self._choose_dtype()
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
         require_choice("cem_dtype", self.cem_dtype, SCORING_DTYPES)
 
-    def _follow_argument(self, name: str) -> None:
-        super()._follow_argument(name)
-        if name == "cem_dtype":
-            self.policy.cem_dtype = self.cem_dtype  # type: ignore[assignment]
+    def _choose_dtype(self) -> None:
+        self.policy.cem_dtype = self.cem_dtype  # type: ignore[assignment]

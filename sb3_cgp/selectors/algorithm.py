@@ -1,4 +1,4 @@
-"""CGP whose CEM may start from the actor, and whose arguments may be changed on the model."""
+"""CGP whose CEM may start from the actor, and whose selector may be changed on the model."""
 
 import warnings
 from typing import Any, ClassVar
@@ -7,9 +7,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cgp.common.rules import require, require_choice
 from sb3_cgp.core.cem import CEM, ActionSelector
-from sb3_cgp.core.cgp import CGP
 from sb3_cgp.selectors.actor_cem import ActorCEM
 from sb3_cgp.selectors.actor_only import ActorOnly
+from sb3_cgp.selectors.changes import ChangeableAlgorithm
 from sb3_cgp.selectors.policies import CGPPolicy
 from sb3_cgp.selectors.proposals import ActorStart, check_start, takes_proposals
 
@@ -18,7 +18,7 @@ STARTS = ("prior", "actor")
 CEM_ARGUMENTS = {"cem_start": "prior"} | {f"cem_{name}": value for name, value in (vars(ActorCEM()) | vars(CEM())).items()}
 
 
-class SelectorAlgorithm(CGP):
+class SelectorAlgorithm(ChangeableAlgorithm):
     """
     CGP whose CEM starts from the prior, as in the paper, or from the actor.
 
@@ -26,9 +26,8 @@ class SelectorAlgorithm(CGP):
     and the actor has not, as in ``learn`` with ``policy_training="offline"``, all samples are the prior's. The offline
     training itself starts from the actor that it trains.
 
-    The ``changeable_arguments`` may be changed on the model, also by a callback: they are checked, and take effect at once.
-    So does another selector that is set on the policy, in the place of the arguments of CEM. It is saved with the model, and
-    checked at the next ``learn``.
+    Another selector that is set on the policy takes effect at once, in the place of the arguments of CEM. It is saved with the
+    model, and checked at the next ``learn``.
     """
 
     # The arguments of the constructor
@@ -36,12 +35,10 @@ class SelectorAlgorithm(CGP):
     cem_actor_fraction: float = 0.5
     cem_actor_std: float = 0.3
 
-    # The arguments that are checked and followed when they are changed on a model
-    changeable_arguments: ClassVar[tuple[str, ...]] = (
-        *CEM_ARGUMENTS,
-        *("policy_loss", "policy_training", "policy_delay", "inference"),
-        *("target_update_interval", "target_policy_noise", "target_noise_clip"),
-    )
+    changeable_arguments: ClassVar[dict[str, str | None]] = {
+        **ChangeableAlgorithm.changeable_arguments,
+        **dict.fromkeys(CEM_ARGUMENTS),
+    }
 
     def _setup_model(self) -> None:
         given = self.policy_kwargs.get("actor_proposes")
@@ -86,39 +83,18 @@ class SelectorAlgorithm(CGP):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_initial_selector"]
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        """
-        Set an attribute. An argument of CGP that is changed on a model takes effect at once; after an error it is unchanged.
-
-        :param name: the attribute's name
-        :param value: its value
-        :raises ValueError: if the argument is out of its range or contradicts another one
-        """
-        if name not in self.changeable_arguments or "policy" not in vars(self):
-            super().__setattr__(name, value)
-            return
-        before, selector, had_actor = getattr(self, name), self.policy.selector, self._has_actor
-        is_made_here = self._selector_is_made_here
-        super().__setattr__(name, value)
+    def _change_argument(self, name: str, value: Any) -> None:
+        selector, is_made_here = self.policy.selector, self._selector_is_made_here
+        super()._change_argument(name, value)
         try:
-            self._check_arguments()
             if is_made_here:
                 self.policy.selector = self._make_selector()
             self._check_selector()
         except ValueError:
-            super().__setattr__(name, before)
             self.policy.selector = selector
             raise
-        if not is_made_here and name in CEM_ARGUMENTS:
+        if name in CEM_ARGUMENTS:
             self._warn_if_replaced(name)
-        if self._has_actor != had_actor:
-            self._choose_inference()
-        self._follow_argument(name)
-
-    def _follow_argument(self, name: str) -> None:
-        """Set what the policy has of an argument that has changed; of others, the user may have chosen otherwise on it."""
-        if name == "inference":
-            self._choose_inference()
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
