@@ -221,10 +221,13 @@ class Population(ResumableAlgorithm, PopulationMembers):
         """
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
-    def _on_policy_trained(self) -> None:
-        # So that a resumed population does not train this actor again
-        for each in self._checkpoints():
-            each.save()
+    def _train_policy(self, index: int) -> bool:
+        is_trained = super()._train_policy(index)
+        if is_trained:
+            # So that a resumed population does not train this actor again
+            for each in self._checkpoints():
+                each.save()
+        return is_trained
 
     @classmethod
     def load(

@@ -125,26 +125,27 @@ class PopulationMembers(OverlappedTraining):
             self._report_failures()
         return self
 
-    def _on_policy_trained(self) -> None:
-        """Do what is to be done after each actor's offline training."""
-
     def _train_policies(self) -> None:
-        """Train the actors that are due offline, each by its own CGP."""
+        """Train the actors that are due offline."""
         for index in sorted(set(np.flatnonzero(self._policies_due).tolist()) - set(self.failed)):
-            agent = self._make_agent(index)
-            assert self.replay_buffer is not None
-            agent.replay_buffer = copied_column(self.replay_buffer, index)
-            # The axis of the log continues after the steps of all environments
-            agent.num_timesteps = self.num_timesteps
-            agent.set_logger(AgentLogger(self.logger, index))
-            # A population logs none of its agents'
-            agent.diagnostics = False
-            try:
-                self.policy.copy_actor_from(agent.train_policy(), index)
-            except ValueError as error:
-                # Of a loss that is NaN or infinite
-                self._note_failure(index, str(error))
-                continue
-            self._policies_trained[index], self._policies_due[index] = True, False
-            self._choose_inference()
-            self._on_policy_trained()
+            self._train_policy(index)
+
+    def _train_policy(self, index: int) -> bool:
+        """Train an actor offline by its own CGP, and return whether it has not failed."""
+        agent = self._make_agent(index)
+        assert self.replay_buffer is not None
+        agent.replay_buffer = copied_column(self.replay_buffer, index)
+        # The axis of the log continues after the steps of all environments
+        agent.num_timesteps = self.num_timesteps
+        agent.set_logger(AgentLogger(self.logger, index))
+        # A population logs none of its agents'
+        agent.diagnostics = False
+        try:
+            self.policy.copy_actor_from(agent.train_policy(), index)
+        except ValueError as error:
+            # Of a loss that is NaN or infinite
+            self._note_failure(index, str(error))
+            return False
+        self._policies_trained[index], self._policies_due[index] = True, False
+        self._choose_inference()
+        return True
