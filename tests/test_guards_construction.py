@@ -372,3 +372,9 @@ def test_a_model_of_another_algorithm_is_refused_with_the_remedy(other, tmp_path
     other("MlpPolicy", "Pendulum-v1", **SMALL | dict(policy_kwargs=dict(net_arch=[4]))).save(tmp_path / "model")
     with pytest.raises(ValueError, match=r"`policy` is .* Load a model of another algorithm by that algorithm's class"):
         CGP.load(tmp_path / "model")
+
+
+def test_an_argument_that_a_saved_policy_cannot_follow_has_no_remedy_of_another_algorithm(tmp_path):
+    make(CGPPolicy).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"`policy` is .*, but must be .* whose actor can propose actions to the selector\.$"):
+        CGP.load(tmp_path / "model", cem_start="actor")

@@ -44,8 +44,7 @@ class CGP(OffPolicyAlgorithm):
     :param cem_samples: number of actions that CEM samples per state and iteration
     :param cem_elites: number of best samples to which CEM's next iteration is fitted, at most ``cem_samples``
     :param cem_result: "best" acts by the best sample of the last iteration (the paper), "mean" by the elites' mean
-    :param policy_loss: the actor's loss: "cgp" imitates CEM, "qgp" follows the critic's gradient,
-        None trains no actor, so that CEM acts at inference too
+    :param policy_loss: the actor's loss: "cgp" imitates CEM, "qgp" follows the critic's gradient, None leaves acting to CEM
     :param policy_training: "online" trains the actor along with the critics, "offline" at the end of ``learn``
     :param inference: what ``predict`` uses: the "actor", the "averaged_actor" (φ' of Algorithm 2) or "cem". None stands for
         the actor. Rollouts always use CEM, and so does ``predict`` where no actor is trained.
@@ -131,7 +130,8 @@ class CGP(OffPolicyAlgorithm):
     def _setup_model(self) -> None:
         # Not in the constructor: `load` sets the saved arguments after it, and calls this method then
         self._check_arguments()
-        require(issubclass(self.policy_class, CGPPolicy), "policy", self.policy_class, "a subclass of sb3_cgp.CGPPolicy")
+        allowed = "a subclass of sb3_cgp.CGPPolicy. Load a model of another algorithm by that algorithm's class"
+        require(issubclass(self.policy_class, CGPPolicy), "policy", self.policy_class, allowed)
         super()._setup_model()
         self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target

@@ -23,16 +23,12 @@ SelfArgumentGuard = TypeVar("SelfArgumentGuard", bound="ArgumentGuard")
 SLOTS = {CallbackList: "callbacks", EventCallback: "callback", EvalCallback: "callback_on_new_best"}
 # Arguments that populations of agents have, and no other algorithm has
 POPULATION_ARGUMENTS = {"agents", "overlap"}
-# What to do about errors of `load`, by their beginnings
-LOAD_REMEDIES = {
-    # The policy is the saved one
-    "The value of `policy` is": "Load a model of another algorithm by that algorithm's class.",
-    # SB3's
-    "The specified policy kwargs do not equal": (
-        "Leave `policy_kwargs` out, as a loaded model has those that it was saved with, and set what can be changed on its "
-        "policy, such as `model.policy.selector = ...`."
-    ),
-}
+# The beginning of SB3's error for other policy_kwargs than the saved ones, and what to do about it
+OTHER_POLICY_KWARGS = "The specified policy kwargs do not equal"
+LEAVE_POLICY_KWARGS_OUT = (
+    "Leave `policy_kwargs` out, as a loaded model has those that it was saved with, and set what can be changed on its "
+    "policy, such as `model.policy.selector = ...`."
+)
 CALLBACK = "an instance of a subclass of BaseCallback"
 
 
@@ -109,10 +105,9 @@ class ArgumentGuard(OffPolicyAlgorithm):
         try:
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except ValueError as error:
-            remedy = next((text for start, text in LOAD_REMEDIES.items() if str(error).startswith(start)), None)
-            if remedy is None:
+            if not str(error).startswith(OTHER_POLICY_KWARGS):
                 raise
-            raise ValueError(f"{error} {remedy}") from error
+            raise ValueError(f"{error} {LEAVE_POLICY_KWARGS_OUT}") from error
 
 
 def check_holds(algorithm: type[OffPolicyAlgorithm], saved: SavedModel) -> None:
