@@ -24,8 +24,10 @@ from sb3_cgp.fast.scoring_algorithm import ScoringAlgorithm
 from sb3_cgp.guards.algorithm import GuardedAlgorithm
 from sb3_cgp.guards.arguments import check_callback
 from sb3_cgp.guards.construction import checks_arguments
+from sb3_cgp.guards.explanations import explaining_errors
 from sb3_cgp.guards.losses import LossGuard
 from sb3_cgp.guards.names import suggests_names
+from sb3_cgp.guards.parts import fit_replay_buffer
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
 
 SelfCGP = TypeVar("SelfCGP", bound="CGP")
@@ -273,9 +275,9 @@ class CGP(
         allowed = "None: call `learn`, which resumes the interrupted training, before `train_policy`"
         require(self.resumption is None, "resumption", "a loaded state", allowed)
         check_callback("callback", callback)
-        with self.as_training(), self._explaining_errors():
+        with self.as_training(), explaining_errors(self):
             self._check_normalisation()
-            self._fit_replay_buffer()
+            fit_replay_buffer(self)
             return super().train_policy(max_steps, batch_size, callback, progress_bar)
 
     @classmethod

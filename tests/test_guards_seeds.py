@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor, VecNorma
 
 from sb3_cgp import CGP
 from sb3_cgp.guards import GuardedAlgorithm
-from sb3_cgp.guards.networks import NetworkGuard
+from sb3_cgp.guards.algorithm import CommonGuards
 from sb3_cgp.guards.normalisation import NormalisationGuard
 from sb3_cgp.population import Population
 
@@ -67,7 +67,8 @@ def test_a_population_takes_environments_that_cannot_be_seeded(pool):
 
 
 def test_a_population_has_all_guards_but_those_that_its_agents_need():
-    assert {*GuardedAlgorithm.__bases__} - {*Population.__mro__} == {NetworkGuard, NormalisationGuard}
+    assert {*GuardedAlgorithm.__bases__} - {*Population.__mro__} == {NormalisationGuard}
+    assert Population._try_networks is CommonGuards._try_networks is not GuardedAlgorithm._try_networks
 
 
 @pytest.mark.parametrize("algorithm", [CGP, lambda *args, **kwargs: Population(*args, 2, **kwargs)])

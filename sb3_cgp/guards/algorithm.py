@@ -1,41 +1,210 @@
-"""All guards in one class, to be mixed into an off-policy algorithm of SB3's."""
+"""
+What is checked when: all guards in one class, to be mixed into an off-policy algorithm of SB3's.
 
-from sb3_cgp.guards.arguments import ArgumentGuard
-from sb3_cgp.guards.construction import ConstructionGuard
-from sb3_cgp.guards.dummy_vec_env import DummyVecEnvGuard
+To add a check, write a function in the file of its subject, or a context manager that explains an error, and call it here.
+"""
+
+import io
+import pathlib
+from typing import Any, TypeVar
+
+import torch as th
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_cgp.common.rules import require
+from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
+from sb3_cgp.common.spaces import check_action_space
+from sb3_cgp.guards.arguments import check_learn_arguments, effective_load_arguments, explaining_policy_kwargs
+from sb3_cgp.guards.construction import check_env, check_policy_and_env, check_policy_name, explaining_policy
+from sb3_cgp.guards.contents import check_contents
+from sb3_cgp.guards.dummy_vec_env import observing_environments
 from sb3_cgp.guards.episodes import EpisodeGuard
-from sb3_cgp.guards.explanations import ExplanationGuard
+from sb3_cgp.guards.explanations import explaining_errors
 from sb3_cgp.guards.learning_starts import LearningStartsGuard
-from sb3_cgp.guards.networks import NetworkGuard
-from sb3_cgp.guards.normalisation import NormalisationGuard
-from sb3_cgp.guards.parts import PartsGuard
-from sb3_cgp.guards.paths import PathGuard
-from sb3_cgp.guards.seeds import SeedGuard
+from sb3_cgp.guards.networks import check_goals, check_observation_space, try_networks
+from sb3_cgp.guards.normalisation import NormalisationGuard, check_wrappers
+from sb3_cgp.guards.parts import (
+    check_action_noise,
+    check_replay_buffer,
+    check_replay_buffer_kwargs,
+    fit_action_noise,
+    fit_replay_buffer,
+)
+from sb3_cgp.guards.paths import find_file
+from sb3_cgp.guards.seeds import warning_of_missing_seed
 from sb3_cgp.guards.transitions import TransitionGuard
-from sb3_cgp.guards.workers import WorkerGuard
+from sb3_cgp.guards.workers import discard_replies, watching_workers
+
+SelfCommonGuards = TypeVar("SelfCommonGuards", bound="CommonGuards")
 
 
-class CommonGuards(
-    PathGuard,
-    ConstructionGuard,
-    ArgumentGuard,
-    SeedGuard,
-    WorkerGuard,
-    ExplanationGuard,
-    DummyVecEnvGuard,
-    PartsGuard,
-    # Before EpisodeGuard, whose `_setup_learn` resets the environment: the first observations are checked after that
-    TransitionGuard,
-    EpisodeGuard,
-    LearningStartsGuard,
-):
-    """The guards that populations have too, whose agents have tried their networks one by one, and no ``VecNormalize``."""
+class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
+    """
+    The guards that populations have too, whose agents have tried their networks one by one, and no ``VecNormalize``.
+
+    Those that hold a state during a training are the base classes, which also override what SB3 does at each step.
+    """
+
+    # SB3 has no public method that `load`, `set_env` and the constructor share. Its method is a static one, which could not
+    # call that of its base class.
+    @classmethod
+    def _wrap_env(cls, env: GymEnv | str, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        check_env(env)
+        wrapped = super()._wrap_env(maybe_make_env(env, verbose), verbose, monitor_wrapper)
+        # Before SB3's assertions on the space
+        check_action_space(wrapped.action_space)
+        return wrapped
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        check_policy_name(policy_name, self.policy_aliases)
+        return super()._get_policy_from_name(policy_name)
+
+    def _setup_model(self) -> None:
+        check_policy_and_env(self)
+        with explaining_policy(self):
+            check_action_noise(self.action_noise, self.action_space)
+            check_replay_buffer_kwargs(replay_buffer_class_of(self), self.replay_buffer_kwargs)
+            check_observation_space(self.observation_space)
+            check_goals(self)
+            super()._setup_model()
+            self._try_networks()
+
+    def _try_networks(self) -> None:
+        """Try the networks that have just been made."""
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        Set the seed of all random generators, as SB3 does, and warn if that of the environments cannot be set.
+
+        :param seed: the seed
+        """
+        # Python's random generator takes no integer of NumPy's
+        seed = None if seed is None else int(seed)
+        with warning_of_missing_seed(self.env, seed):
+            super().set_random_seed(seed)
+
+    @classmethod
+    def load(
+        cls: type[SelfCommonGuards],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfCommonGuards:
+        """
+        Load a model from a zip-file.
+
+        :param path: path to the file, with or without its suffix, or an open file
+        :param env: see SB3's method
+        :param device: see SB3's method
+        :param custom_objects: see SB3's method
+        :param print_system_info: see SB3's method
+        :param force_reset: see SB3's method
+        :param kwargs: arguments to change in the model
+        :return: the model
+        :raises IsADirectoryError: if the path is a folder without a zip-file of the same name beside it
+        :raises TypeError: if a model has no such argument or attribute, naming it and the nearest one that is allowed
+        :raises ValueError: if the value of an argument of SB3's is wrong, naming it, or if the file holds a population and the
+            class is that of one agent, or the reverse
+        """
+        path = find_file(cls, path, "zip")
+        kwargs = effective_load_arguments(cls, path, device, custom_objects, kwargs)
+        with explaining_policy_kwargs():
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+    def set_parameters(self, load_path_or_dict: Any, *args: Any, **kwargs: Any) -> None:
+        """
+        Load parameters from a zip-file or a nested dictionary.
+
+        :param load_path_or_dict: path to the file, an open file, or the parameters by module
+        :param args: the algorithm's own arguments
+        :param kwargs: the algorithm's own arguments
+        :raises IsADirectoryError: if the path is a folder without a zip-file of the same name beside it
+        """
+        super().set_parameters(find_file(type(self), load_path_or_dict, "zip"), *args, **kwargs)
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load a replay buffer from a pickle file. If it does not fit the model, the model keeps the buffer that it has.
+
+        :param path: path to the file, with or without its suffix, or an open file
+        :param truncate_last_traj: When using ``HerReplayBuffer`` with online sampling: whether the last trajectory in the
+            replay buffer was finished. With False, it is continued where the environment is still at its end.
+        :raises IsADirectoryError: if the path is a folder without a pickle file of the same name beside it
+        :raises ValueError: if the buffer is of other spaces or of another number of environments than the model
+        """
+        previous = self.replay_buffer
+        super().load_replay_buffer(find_file(type(self), path, "pkl"), truncate_last_traj)
+        assert self.replay_buffer is not None
+        try:
+            check_replay_buffer(self.replay_buffer, self)
+        except ValueError:
+            self.replay_buffer = previous
+            raise
+
+    def learn(
+        self: SelfCommonGuards, total_timesteps: int, callback: Any = None, log_interval: Any = 4, *args: Any, **kwargs: Any
+    ) -> SelfCommonGuards:
+        """
+        Learn, if the arguments are right, and explain what fails.
+
+        :param total_timesteps: number of environment steps, an integer >= 0, or an equal float such as 1e5
+        :param callback: callback(s) called at every step with state of the algorithm.
+        :param log_interval: number of episodes between two writings of the log; None for no writing
+        :param args: the algorithm's own arguments
+        :param kwargs: the algorithm's own arguments
+        :return: the trained model
+        :raises ValueError: naming the first argument that is wrong, its value and what is allowed, or the fault of an
+            environment
+        :raises RuntimeError: if a worker of a ``SubprocVecEnv`` has died; its environment is closed
+        """
+        total_timesteps = check_learn_arguments(self, total_timesteps, callback, log_interval)
+        with (
+            watching_workers(self),
+            explaining_errors(self),
+            observing_environments(self),
+            self._expecting_gradient_steps(),
+        ):
+            return super().learn(total_timesteps, callback, log_interval, *args, **kwargs)
+
+    def _setup_learn(
+        self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any, **kwargs: Any
+    ) -> tuple[int, Any]:
+        discard_replies(self.env)
+        allowed = f"an environment: `{type(self).__name__}.load(path, env)`, or `set_env` before `learn`"
+        require(self.env is not None, "env", self.env, allowed)
+        fit_action_noise(self)
+        check_action_noise(self.action_noise, self.action_space)
+        if self.replay_buffer is not None:
+            check_replay_buffer(self.replay_buffer, self)
+            check_contents(self.replay_buffer)
+        with self._beginning_episodes(reset_num_timesteps):
+            result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
+            self._announce_warm_up(result[0])
+        # The environment has been reset, if it has to be
+        self._begin_checks()
+        fit_replay_buffer(self)
+        return result
 
 
-class GuardedAlgorithm(CommonGuards, NormalisationGuard, NetworkGuard):
+class GuardedAlgorithm(CommonGuards, NormalisationGuard):
     """
     An algorithm that notices faults of environments and wrong use, and names them or does the right thing.
 
-    It comes before an algorithm among a class's bases: ``class GuardedTD3(GuardedAlgorithm, TD3)``. Each base is a guard of
-    its own, and works without the others.
+    It comes before an algorithm among a class's bases: ``class GuardedTD3(GuardedAlgorithm, TD3)``.
     """
+
+    @classmethod
+    def _wrap_env(cls, env: GymEnv | str, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        wrapped = super()._wrap_env(env, verbose, monitor_wrapper)
+        check_wrappers(wrapped)
+        return wrapped
+
+    def _try_networks(self) -> None:
+        try_networks(self)

@@ -1,23 +1,19 @@
 """Arguments of a wrong type or name, which SB3 ignores or answers with an error far from its cause."""
 
-import io
 import math
-import pathlib
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from numbers import Real
-from typing import Any, TypeVar
+from typing import Any
 
-import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EventCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_cgp.common.load_arguments import SavedModel, check_load_arguments, misspelt_custom_objects, saved_attribute_names
 from sb3_cgp.common.rules import as_count, require
 from sb3_cgp.common.sb3_arguments import check_train_freq, constructor_argument_names
 from sb3_cgp.guards.construction import check_constructor_arguments
-
-SelfArgumentGuard = TypeVar("SelfArgumentGuard", bound="ArgumentGuard")
 
 # The attributes in which SB3's classes hold other callbacks
 SLOTS = {CallbackList: "callbacks", EventCallback: "callback", EvalCallback: "callback_on_new_best"}
@@ -32,82 +28,81 @@ LEAVE_POLICY_KWARGS_OUT = (
 CALLBACK = "an instance of a subclass of BaseCallback"
 
 
-class ArgumentGuard(OffPolicyAlgorithm):
-    """An algorithm that refuses wrong arguments of ``learn`` and ``load`` when they are called."""
+def check_learn_arguments(model: OffPolicyAlgorithm, total_timesteps: Any, callback: Any, log_interval: Any) -> int:
+    """
+    Check the arguments of ``learn``, and ``train_freq``, which may have been set on the model.
 
-    def learn(
-        self: SelfArgumentGuard, total_timesteps: int, callback: Any = None, log_interval: Any = 4, *args: Any, **kwargs: Any
-    ) -> SelfArgumentGuard:
-        """
-        Learn, if the arguments are right.
+    :param model: the model
+    :param total_timesteps: number of environment steps, an integer >= 0, or an equal float such as 1e5
+    :param callback: callback(s) called at every step with state of the algorithm.
+    :param log_interval: number of episodes between two writings of the log; None for no writing
+    :return: the number of environment steps
+    :raises ValueError: naming the first argument that is wrong, its value and what is allowed
+    """
+    is_infinite = isinstance(total_timesteps, float) and total_timesteps == math.inf
+    advice = ": for a training that a callback ends, give a large one such as 10**12" if is_infinite else ""
+    count = as_count("total_timesteps", total_timesteps, minimum=0, advice=advice)
+    check_callback("callback", callback)
+    # SB3 converts it when the model is made, by this private method, and not again.
+    check_train_freq(model.train_freq, model.n_envs)
+    model._convert_train_freq()
+    allowed = "a number of episodes other than 0, or None to write no log"
+    is_interval = log_interval is None or (isinstance(log_interval, Real) and log_interval != 0)
+    require(is_interval, "log_interval", log_interval, allowed)
+    return count
 
-        :param total_timesteps: number of environment steps, an integer >= 0, or an equal float such as 1e5
-        :param callback: callback(s) called at every step with state of the algorithm.
-        :param log_interval: number of episodes between two writings of the log; None for no writing
-        :param args: the algorithm's own arguments
-        :param kwargs: the algorithm's own arguments
-        :return: the trained model
-        :raises ValueError: naming the first argument that is wrong, its value and what is allowed
-        """
-        is_infinite = isinstance(total_timesteps, float) and total_timesteps == math.inf
-        advice = ": for a training that a callback ends, give a large one such as 10**12" if is_infinite else ""
-        total_timesteps = as_count("total_timesteps", total_timesteps, minimum=0, advice=advice)
-        check_callback("callback", callback)
-        # It may have been set on the model. SB3 converts it when the model is made, by this private method, and not again.
-        check_train_freq(self.train_freq, self.n_envs)
-        self._convert_train_freq()
-        allowed = "a number of episodes other than 0, or None to write no log"
-        is_interval = log_interval is None or (isinstance(log_interval, Real) and log_interval != 0)
-        require(is_interval, "log_interval", log_interval, allowed)
-        return super().learn(total_timesteps, callback, log_interval, *args, **kwargs)
 
-    @classmethod
-    def load(
-        cls: type[SelfArgumentGuard],
-        path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
-        device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        **kwargs: Any,
-    ) -> SelfArgumentGuard:
-        """
-        Load a model from a zip-file.
+def effective_load_arguments(
+    algorithm: type[OffPolicyAlgorithm],
+    saved: SavedModel,
+    device: Any,
+    custom_objects: dict[str, Any] | None,
+    given: dict[str, Any],
+) -> dict[str, Any]:
+    """
+    Check the arguments of ``load``, and warn of those without effect.
 
-        :param path: path to the file, or an open file
-        :param env: see SB3's method
-        :param device: see SB3's method
-        :param custom_objects: see SB3's method
-        :param print_system_info: see SB3's method
-        :param force_reset: see SB3's method
-        :param kwargs: arguments to change in the model
-        :return: the model
-        :raises TypeError: if a model has no such argument or attribute, naming it and the nearest one that is allowed
-        :raises ValueError: if the value of an argument of SB3's is wrong, naming it, or if the file holds a population and the
-            class is that of one agent, or the reverse
-        """
-        check_holds(cls, path)
-        check_load_arguments(cls, path, kwargs)
-        check_constructor_arguments(kwargs | {"device": device})
-        if "policy" in kwargs:
-            message = (
-                f"`policy={kwargs.pop('policy')!r}` has no effect: a loaded model keeps the policy that it was saved with."
-            )
-            warnings.warn(message, stacklevel=2)
-        if "stats_window_size" in kwargs:
-            # SB3 keeps this argument under another name
-            kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
-        if custom_objects:
-            for name, similar in misspelt_custom_objects(path, custom_objects).items():
-                message = f"custom_objects[{name!r}] has no effect, as the saved model has no such attribute: {similar!r}?"
-                warnings.warn(message, stacklevel=2)
-        try:
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-        except ValueError as error:
-            if not str(error).startswith(OTHER_POLICY_KWARGS):
-                raise
-            raise ValueError(f"{error} {LEAVE_POLICY_KWARGS_OUT}") from error
+    :param algorithm: the algorithm's class
+    :param saved: the path of the saved model, or an open file
+    :param device: the argument ``device``
+    :param custom_objects: the argument ``custom_objects``
+    :param given: the arguments to change in the model
+    :return: those that have an effect, by the names that SB3 has for them
+    :raises TypeError: if a model has no such argument or attribute, naming it and the nearest one that is allowed
+    :raises ValueError: if the value of an argument of SB3's is wrong, naming it, or if the file holds a population and the
+        class is that of one agent, or the reverse
+    """
+    check_holds(algorithm, saved)
+    check_load_arguments(algorithm, saved, given)
+    check_constructor_arguments(given | {"device": device})
+    effective = dict(given)
+    if "policy" in effective:
+        message = (
+            f"`policy={effective.pop('policy')!r}` has no effect: a loaded model keeps the policy that it was saved with."
+        )
+        warnings.warn(message, stacklevel=3)
+    if "stats_window_size" in effective:
+        # SB3 keeps this argument under another name
+        effective["_stats_window_size"] = effective.pop("stats_window_size")
+    for name, similar in misspelt_custom_objects(saved, custom_objects or {}).items():
+        message = f"custom_objects[{name!r}] has no effect, as the saved model has no such attribute: {similar!r}?"
+        warnings.warn(message, stacklevel=3)
+    return effective
+
+
+@contextmanager
+def explaining_policy_kwargs() -> Iterator[None]:
+    """
+    Add the remedy to SB3's error for other ``policy_kwargs`` than those of the model that is loaded within the context.
+
+    :raises ValueError: in place of SB3's
+    """
+    try:
+        yield
+    except ValueError as error:
+        if not str(error).startswith(OTHER_POLICY_KWARGS):
+            raise
+        raise ValueError(f"{error} {LEAVE_POLICY_KWARGS_OUT}") from error
 
 
 def check_holds(algorithm: type[OffPolicyAlgorithm], saved: SavedModel) -> None:

@@ -3,7 +3,8 @@
 import functools
 import inspect
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from numbers import Real
 from typing import Any, ParamSpec, TypeVar
 
@@ -11,12 +12,9 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import get_device
-from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_cgp.common.rules import nearest, require, require_count
@@ -50,64 +48,84 @@ def checks_arguments(constructor: Callable[P, T]) -> Callable[P, T]:
     return checked
 
 
-class ConstructionGuard(OffPolicyAlgorithm):
+def check_env(env: Any) -> None:
     """
-    An algorithm that explains wrong policies, arguments of policies and environments when it is made or loaded.
+    Refuse what is no environment.
 
-    ``load`` and ``set_env`` take the name of an environment, as the constructor does, and make one.
+    :param env: the environment, or its name
+    :raises ValueError: naming it, and the remedy
     """
+    remedy = ""
+    if isinstance(env, type):
+        remedy = f": write `{env.__name__}(...)`, with its arguments"
+    elif isinstance(env, gym.vector.VectorEnv):
+        remedy = ", which SB3's `make_vec_env(name, n_envs=N)` makes"
+    elif callable(env) and not hasattr(env, "step"):
+        remedy = ", which `make_vec_env(function)` makes"
+    require(not remedy and (isinstance(env, str) or hasattr(env, "step")), "env", env, f"{ENVIRONMENT}{remedy}")
 
-    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
-        known = ", ".join(map(repr, self.policy_aliases))
-        similar = nearest(policy_name, self.policy_aliases)
-        advice = "" if similar is None else f" Did you mean {similar!r}?"
-        if policy_name not in self.policy_aliases:
-            raise ValueError(
-                f"The value of `policy` is {policy_name!r}, but must be one of {known}, or a class of policies.{advice}"
-            )
-        return super()._get_policy_from_name(policy_name)
 
-    # SB3 has no public method that `load`, `set_env` and the constructor share. Its method is a static one, which could not
-    # call that of its base class.
-    @classmethod
-    def _wrap_env(cls, env: GymEnv | str, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        remedy = ""
-        if isinstance(env, type):
-            remedy = f": write `{env.__name__}(...)`, with its arguments"
-        elif isinstance(env, gym.vector.VectorEnv):
-            remedy = ", which SB3's `make_vec_env(name, n_envs=N)` makes"
-        elif callable(env) and not hasattr(env, "step"):
-            remedy = ", which `make_vec_env(function)` makes"
-        require(not remedy and (isinstance(env, str) or hasattr(env, "step")), "env", env, f"{ENVIRONMENT}{remedy}")
-        return super()._wrap_env(maybe_make_env(env, verbose), verbose, monitor_wrapper)
+def check_policy_name(name: str, aliases: Mapping[str, type[BasePolicy]]) -> None:
+    """
+    Refuse a name that is none of an algorithm's policies'.
 
-    def _setup_model(self) -> None:
-        allowed = f"a class of policies, or one of {', '.join(map(repr, self.policy_aliases))}"
-        require(isinstance(self.policy_class, type), "policy", self.policy_class, allowed)
-        # `load` sets the spaces where there is no environment
-        has_space = getattr(self, "observation_space", None) is not None
-        require(has_space, "env", None, f"{ENVIRONMENT}: only `load` needs none")
+    :param name: the policy's name
+    :param aliases: the policies by their names
+    :raises ValueError: with the nearest name
+    """
+    similar = nearest(name, aliases)
+    advice = "" if similar is None else f" Did you mean {similar!r}?"
+    if name not in aliases:
+        known = ", ".join(map(repr, aliases))
+        raise ValueError(f"The value of `policy` is {name!r}, but must be one of {known}, or a class of policies.{advice}")
+
+
+def check_policy_and_env(model: OffPolicyAlgorithm) -> None:
+    """
+    Check that a model whose networks are to be made has a class of policies, and spaces.
+
+    :param model: the model
+    :raises ValueError: if the policy is no class, or there is no environment
+    """
+    allowed = f"a class of policies, or one of {', '.join(map(repr, model.policy_aliases))}"
+    require(isinstance(model.policy_class, type), "policy", model.policy_class, allowed)
+    # `load` sets the spaces where there is no environment
+    has_space = getattr(model, "observation_space", None) is not None
+    require(has_space, "env", None, f"{ENVIRONMENT}: only `load` needs none")
+
+
+@contextmanager
+def explaining_policy(model: OffPolicyAlgorithm) -> Iterator[None]:
+    """
+    Raise an error that names the policy, or one of its arguments that breaks a rule, in place of one that does not.
+
+    Not beforehand, as a policy of the user's own may take other arguments and values.
+
+    :param model: the model whose policy is made within the context
+    :raises ValueError: if the policy is for other observations, or the value of an argument of SB3's policies is wrong
+    :raises TypeError: if the policy takes no such argument
+    """
+    try:
+        with naming_policy_argument(model):
+            yield
+    except Exception as error:
         try:
-            with naming_policy_argument(self):
-                super()._setup_model()
-        except Exception as error:
-            # Not beforehand, as a policy of the user's own may take other values
-            self._explain_policy(error)
-            raise
-
-    def _explain_policy(self, error: Exception) -> None:
-        """Raise an error that names the policy, or the first of its arguments, that breaks a rule of SB3's policies."""
-        try:
-            multi_input = self.policy_aliases.get("MultiInputPolicy")
-            is_multi_input = multi_input is not None and issubclass(self.policy_class, multi_input)
-            is_shared = multi_input is self.policy_aliases.get("MlpPolicy")
-            if is_multi_input and not is_shared and "features_extractor_class" not in self.policy_kwargs:
-                allowed = f"'MlpPolicy', or 'CnnPolicy' for images: the observation space is {self.observation_space}"
-                is_dict = isinstance(self.observation_space, spaces.Dict)
-                require(is_dict, "policy", self.policy_class.__name__, allowed)
-            check_policy_arguments(self.policy_kwargs)
+            _check_policy(model)
         except ValueError as explanation:
             raise explanation from error
+        raise
+
+
+def _check_policy(model: OffPolicyAlgorithm) -> None:
+    """Check that SB3's policy for ``Dict`` observations is given such, and the arguments of SB3's policies."""
+    multi_input = model.policy_aliases.get("MultiInputPolicy")
+    is_multi_input = multi_input is not None and issubclass(model.policy_class, multi_input)
+    is_shared = multi_input is model.policy_aliases.get("MlpPolicy")
+    if is_multi_input and not is_shared and "features_extractor_class" not in model.policy_kwargs:
+        allowed = f"'MlpPolicy', or 'CnnPolicy' for images: the observation space is {model.observation_space}"
+        is_dict = isinstance(model.observation_space, spaces.Dict)
+        require(is_dict, "policy", model.policy_class.__name__, allowed)
+    check_policy_arguments(model.policy_kwargs)
 
 
 def check_constructor_arguments(given: Mapping[str, Any]) -> None:

@@ -4,7 +4,7 @@ import copy
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, SupportsIndex, TypeVar
+from typing import Any, SupportsIndex
 
 import gymnasium as gym
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -14,34 +14,27 @@ from sb3_cgp.guards.explanations import check_reset_info
 from sb3_cgp.guards.observations import innermost
 from sb3_cgp.guards.transitions import check_final_observation, check_shape
 
-SelfDummyVecEnvGuard = TypeVar("SelfDummyVecEnvGuard", bound="DummyVecEnvGuard")
 
-
-class DummyVecEnvGuard(OffPolicyAlgorithm):
+@contextmanager
+def observing_environments(model: OffPolicyAlgorithm) -> Iterator[None]:
     """
-    An algorithm that sees the observations of a ``DummyVecEnv`` as its environments return them.
+    See the observations of a ``DummyVecEnv`` as its environments return them.
 
-    It refuses those that NumPy would broadcast to the array in which a ``DummyVecEnv`` collects them. It checks an episode's
-    final one before ``VecNormalize`` clips it, and copies it before the environment's ``reset`` can overwrite it; the latter
+    Those that NumPy would broadcast to the array in which a ``DummyVecEnv`` collects them are refused. An episode's final one
+    is checked before ``VecNormalize`` clips it, and copied before the environment's ``reset`` can overwrite it; the latter
     not in a subclass with a ``step_wait`` that takes no environment from ``envs`` between its step and its reset.
+
+    :param model: the model that learns within the context
+    :raises ValueError: if an observation is of a wrong shape, or ``reset`` returns no dictionary beside it
     """
-
-    def learn(self: SelfDummyVecEnvGuard, *args: Any, **kwargs: Any) -> SelfDummyVecEnvGuard:
-        """
-        Learn from the observations that the environments return.
-
-        :param args: the algorithm's own arguments
-        :param kwargs: the algorithm's own arguments
-        :return: the trained model
-        :raises ValueError: if an observation is of a wrong shape, or ``reset`` returns no dictionary beside it
-        """
-        env = innermost(self.env)
-        if not isinstance(env, DummyVecEnv):
-            return super().learn(*args, **kwargs)
-        # A private method, as nothing outside of the environment sees an observation before it is collected
-        observer = _ObservationObserver(env, self, is_clipped=_sees_raw(self.get_vec_normalize_env()))
-        with _shadowed(env, "_save_obs", observer.save), _observed(env, observer):
-            return super().learn(*args, **kwargs)
+    env = innermost(model.env)
+    if not isinstance(env, DummyVecEnv):
+        yield
+        return
+    # A private method, as nothing outside of the environment sees an observation before it is collected
+    observer = _ObservationObserver(env, model, is_clipped=_sees_raw(model.get_vec_normalize_env()))
+    with _shadowed(env, "_save_obs", observer.save), _observed(env, observer):
+        yield
 
 
 class _ObservationObserver:

@@ -2,6 +2,8 @@
 
 import copy
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,20 +41,19 @@ class EpisodeGuard(OffPolicyAlgorithm):
     _has_warned_of_moves: bool = False
     _is_in_rollout: bool = False
 
-    def _setup_learn(
-        self, total_timesteps: int, callback: Any = None, reset_num_timesteps: bool = True, *args: Any, **kwargs: Any
-    ) -> tuple[int, Any]:
+    @contextmanager
+    def _beginning_episodes(self, reset_num_timesteps: bool) -> Iterator[None]:
+        """Let SB3 reset an environment that has moved, within the context, and end the last episode unless it goes on."""
         if self._env_has_moved() or count_envs(self._original_last_obs) != self.n_envs:
             # SB3 resets the environment then
             self._last_obs = None
         is_reset = reset_num_timesteps or self._last_obs is None
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
+        yield
         self._has_warned_of_moves = False
         if is_reset:
             self._note_reset()
         elif self.replay_buffer is not None and not continues_last_episode(self.replay_buffer, self._original_last_obs):
             end_last_episode(self.replay_buffer)
-        return result
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """

@@ -6,15 +6,13 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
-
-SelfExplanationGuard = TypeVar("SelfExplanationGuard", bound="ExplanationGuard")
 
 OLD_API = (
     "The environment has the API of Gym before version 0.26. Change it, or wrap it in `shimmy.GymV21CompatibilityV0(env=env)`."
@@ -36,35 +34,21 @@ OLD_VEC_STEP = (
 NO_INFO = "The environment's `{}` must return a dictionary as its last value, `info`; an empty one, `{{}}`, will do."
 
 
-class ExplanationGuard(OffPolicyAlgorithm):
-    """An algorithm whose ``learn`` explains errors that SB3 raises far from their cause."""
+@contextmanager
+def explaining_errors(model: OffPolicyAlgorithm) -> Iterator[None]:
+    """
+    Raise an error that names the cause and the remedy in place of one that does not, as its cause.
 
-    def learn(self: SelfExplanationGuard, *args: Any, **kwargs: Any) -> SelfExplanationGuard:
-        """
-        Learn, and explain an error of SB3's.
-
-        :param args: the algorithm's own arguments
-        :param kwargs: the algorithm's own arguments
-        :return: the trained model
-        :raises ValueError: naming the cause, and the remedy
-        """
-        with self._explaining_errors():
-            return super().learn(*args, **kwargs)
-
-    @contextmanager
-    def _explaining_errors(self) -> Iterator[None]:
-        """
-        Raise an error that names the cause and the remedy in place of one that does not, as its cause.
-
-        :raises ValueError: in place of SB3's error; other errors pass
-        """
-        try:
-            yield
-        except (TypeError, ValueError, RuntimeError) as error:
-            message = explain(error, self)
-            if message is None:
-                raise
-            raise ValueError(message) from error
+    :param model: the model that learns within the context
+    :raises ValueError: in place of SB3's error; other errors pass
+    """
+    try:
+        yield
+    except (TypeError, ValueError, RuntimeError) as error:
+        message = explain(error, model)
+        if message is None:
+            raise
+        raise ValueError(message) from error
 
 
 def check_reset_info(info: Any) -> None:

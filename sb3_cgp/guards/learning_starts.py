@@ -2,8 +2,8 @@
 
 import math
 import warnings
-from collections.abc import Sequence
-from typing import Any, TypeVar
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -11,8 +11,6 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_cgp.guards.observations import innermost
-
-SelfLearningStartsGuard = TypeVar("SelfLearningStartsGuard", bound="LearningStartsGuard")
 
 
 class LearningStartsGuard(OffPolicyAlgorithm):
@@ -32,30 +30,23 @@ class LearningStartsGuard(OffPolicyAlgorithm):
     # The warning of this training, which is not repeated at its end
     _has_warned: bool = False
 
-    def learn(self: SelfLearningStartsGuard, *args: Any, **kwargs: Any) -> SelfLearningStartsGuard:
-        """
-        Learn, and warn if that takes no gradient step.
-
-        :param args: the algorithm's own arguments
-        :param kwargs: the algorithm's own arguments
-        :return: the trained model
-        """
+    @contextmanager
+    def _expecting_gradient_steps(self) -> Iterator[None]:
+        """Warn if the training within the context has ended by itself without a gradient step."""
         self._n_updates_at_start, self._has_warned = self._n_updates, False
-        result = super().learn(*args, **kwargs)
+        yield
         has_ended = self._num_timesteps_at_start < self._total_timesteps <= self.num_timesteps
         has_trained = self._n_updates > self._n_updates_at_start
         if self._trains_by_episode and has_ended and not has_trained and not self._has_warned:
             self._warn_of_no_gradient_step(self.num_timesteps)
-        return result
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
-        total_timesteps, callback = super()._setup_learn(*args, **kwargs)
+    def _announce_warm_up(self, total_timesteps: int) -> None:
+        """Print how many steps are random, and warn if a training to ``total_timesteps`` will take no gradient step."""
         if self.num_timesteps < total_timesteps:
             self._print_warm_up(total_timesteps)
             last_timestep = self._last_timestep(total_timesteps)
             if last_timestep is not None:
                 self._warn_of_no_gradient_step(last_timestep, " at the latest" if self._trains_by_episode else "")
-        return total_timesteps, callback
 
     def _last_timestep(self, total_timesteps: int) -> int | None:
         """Return the largest environment step at which the last rollout may end; None if no episode has a limit."""

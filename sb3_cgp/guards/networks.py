@@ -21,17 +21,6 @@ from sb3_cgp.guards.observations import innermost
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
-class NetworkGuard(OffPolicyAlgorithm):
-    """An algorithm that tries its networks on a small batch of random observations when it is made or loaded."""
-
-    def _setup_model(self) -> None:
-        check_observation_space(self.observation_space)
-        if isinstance(self.replay_buffer_class, type) and issubclass(self.replay_buffer_class, HerReplayBuffer):
-            check_goals(self)
-        super()._setup_model()
-        try_networks(self)
-
-
 def check_observation_space(space: spaces.Space) -> None:
     """
     Refuse scalars, which neither SB3's replay buffer nor its ``CombinedExtractor`` takes.
@@ -52,9 +41,11 @@ def check_goals(model: OffPolicyAlgorithm) -> None:
     """
     Check that an environment has the goals and the method that hindsight replay (HER) needs.
 
-    :param model: the model; without an environment, only its observation space is checked
+    :param model: the model, of any class of replay buffers; without an environment, only its observation space is checked
     :raises ValueError: if a key of the observations is missing, or the method ``compute_reward``
     """
+    if not (isinstance(model.replay_buffer_class, type) and issubclass(model.replay_buffer_class, HerReplayBuffer)):
+        return
     space = model.observation_space
     is_goal_space = isinstance(space, spaces.Dict) and all(key in space.spaces for key in GOAL_KEYS)
     allowed = f"a Dict with the keys {', '.join(repr(key) for key in GOAL_KEYS)} for a HerReplayBuffer"

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, VecTransposeImage, unwrap_vec_normalize
 
 from sb3_cgp.common.spaces import by_key, have_same_layout
@@ -23,13 +22,6 @@ class NormalisationGuard(OffPolicyAlgorithm):
     # None until the first gradient step
     _learnt_normalized: bool | None = None
     _has_checked_statistics: bool = False
-
-    @classmethod
-    def _wrap_env(cls, env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        # SB3's is a static method, which could not call its base class's
-        wrapped = super()._wrap_env(env, verbose, monitor_wrapper)
-        check_wrappers(wrapped)
-        return wrapped
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
         self._check_normalisation()

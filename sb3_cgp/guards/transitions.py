@@ -230,13 +230,12 @@ class TransitionGuard(OffPolicyAlgorithm):
     # Made anew for each training, as some warn once
     _checks: list[Check]
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
-        result = super()._setup_learn(*args, **kwargs)
+    def _begin_checks(self) -> None:
+        """Make the checks of a training, and check its first observations."""
         # VecNormalize's own space has the bounds of normalised observations, which are not checked
         normalizer = self._vec_normalize_env
         self._checks = make_checks(self.observation_space if normalizer is None else normalizer.venv.observation_space)
         self._check_first_observations()
-        return result
 
     def _check_first_observations(self) -> None:
         """Check the observations that an episode starts with."""

@@ -6,62 +6,50 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing import Pipe, connection
-from typing import Any, TypeVar
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_cgp.guards.observations import innermost
 
-SelfWorkerGuard = TypeVar("SelfWorkerGuard", bound="WorkerGuard")
-
 # Seconds that a process is given to end before it is killed, or is taken to be alive
 GRACE = 5.0
 
 
-class WorkerGuard(OffPolicyAlgorithm):
+@contextmanager
+def watching_workers(model: OffPolicyAlgorithm) -> Iterator[None]:
     """
-    An algorithm whose ``learn`` turns the death of a worker process into an error that names the worker.
+    Turn the death of a worker process into an error that names the worker, and leave no worker process behind.
 
     Watched are the workers of the training environment. A dead worker of a callback's environment is named as well.
+
+    :param model: the model that learns within the context
+    :raises RuntimeError: if a worker of a ``SubprocVecEnv`` has died; its environment is closed
     """
-
-    def learn(self: SelfWorkerGuard, *args: Any, **kwargs: Any) -> SelfWorkerGuard:
-        """
-        Learn, and leave no worker process behind when one of them has died.
-
-        :param args: the algorithm's own arguments
-        :param kwargs: the algorithm's own arguments
-        :return: the trained model
-        :raises RuntimeError: if a worker of a ``SubprocVecEnv`` has died; its environment is closed
-        """
-        with _watching_workers(innermost(self.env)) as watch:
-            try:
-                return super().learn(*args, **kwargs)
-            except (EOFError, ConnectionError) as error:
-                failed = _subproc_env_in(error)
-                if failed is None:
-                    raise
-                dead = watch.wait() if watch is not None and failed is watch.env else _dead_workers(failed)
-                if len(dead) == 0:
-                    raise
-                message = _describe_dead(failed, dead, self.num_timesteps)
-                end_workers(failed)
-                raise RuntimeError(message) from error
-
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
-        env = innermost(self.env)
-        if isinstance(env, SubprocVecEnv) and not env.closed:
-            discard_replies(env)
-        return super()._setup_learn(*args, **kwargs)
+    with _watch_of(innermost(model.env)) as watch:
+        try:
+            yield
+        except (EOFError, ConnectionError) as error:
+            failed = _subproc_env_in(error)
+            if failed is None:
+                raise
+            dead = watch.wait() if watch is not None and failed is watch.env else _dead_workers(failed)
+            if len(dead) == 0:
+                raise
+            message = _describe_dead(failed, dead, model.num_timesteps)
+            end_workers(failed)
+            raise RuntimeError(message) from error
 
 
-def discard_replies(env: SubprocVecEnv) -> None:
+def discard_replies(env: VecEnv | None) -> None:
     """
     Discard the replies that an interrupted step or reset has left unread, which would be taken for those of the next one.
 
-    :param env: the environment
+    :param env: the environment, of which an open ``SubprocVecEnv`` alone has replies
     """
+    env = innermost(env)
+    if not isinstance(env, SubprocVecEnv) or env.closed:
+        return
     is_interrupted = False
     for remote in env.remotes:
         # A worker answers in order, and this request alone by True or False
@@ -143,7 +131,7 @@ _watches: list[_WorkerWatch] = []
 
 
 @contextmanager
-def _watching_workers(env: VecEnv | None) -> Iterator[_WorkerWatch | None]:
+def _watch_of(env: VecEnv | None) -> Iterator[_WorkerWatch | None]:
     """Watch an environment's workers, if it has any. When one has died, close the environment, however the training ends."""
     outer = next((watch for watch in _watches if watch.env is env), None)
     if outer is not None or not isinstance(env, SubprocVecEnv) or env.closed:

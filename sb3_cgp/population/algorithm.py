@@ -17,6 +17,7 @@ from sb3_cgp.common.sb3_arguments import as_schedule
 from sb3_cgp.core.policies import CGPPolicy
 from sb3_cgp.guards.names import suggests_names
 from sb3_cgp.guards.observations import innermost
+from sb3_cgp.guards.paths import find_file
 from sb3_cgp.population.arguments import (
     COMMON,
     OWN,
@@ -251,7 +252,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
         """
         for name in {"agents", *OWN, *COMMON} & kwargs.keys():
             require(name in ("verbose", "tensorboard_log"), name, kwargs[name], "left out: change it in a new population")
-        path = cls._file_of(path, "zip")
+        path = find_file(cls, path, "zip")
         return super().load(path, cls._make_env(env, path), *args, **kwargs)
 
     @classmethod
