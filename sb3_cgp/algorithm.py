@@ -11,6 +11,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
+from sb3_cgp.common.load_arguments import saved_attributes
 from sb3_cgp.common.rules import require
 from sb3_cgp.core import cgp as core
 from sb3_cgp.core.policies import CGPPolicy
@@ -28,6 +29,7 @@ from sb3_cgp.guards.explanations import explaining_errors
 from sb3_cgp.guards.losses import LossGuard
 from sb3_cgp.guards.names import suggests_names
 from sb3_cgp.guards.parts import fit_replay_buffer
+from sb3_cgp.guards.paths import find_file
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
 
 SelfCGP = TypeVar("SelfCGP", bound="CGP")
@@ -306,11 +308,16 @@ class CGP(
         :param force_reset: Force call to ``reset()`` before training to avoid unexpected behaviour.
         :param kwargs: arguments to change in the model when loading, such as ``cem_iterations=4``
         :return: new model instance with loaded parameters
-        :raises ValueError: if a changed argument is out of its range or contradicts another one
+        :raises ValueError: if a changed argument is out of its range or contradicts another one, or if the file holds a
+            population
         :raises TypeError: if a changed argument is none of the constructor and no attribute of the model, naming it and the
             nearest one that is allowed
         :raises IsADirectoryError: if the path is a folder, and there is no zip-file of that name beside it
         """
+        path = find_file(cls, path, "zip")
+        allowed = f"of {cls.__name__}, a single agent: load a population by `sb3_cgp.population.Population.load(path)`"
+        # An attribute `agents` may be the user's
+        require("_agent_updates" not in saved_attributes(path), "path", "a file with the attribute `agents`", allowed)
         if custom_objects is not None and "learning_rate" in custom_objects:
             custom_objects = {"actor_learning_rate": None} | custom_objects
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)

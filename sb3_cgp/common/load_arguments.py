@@ -41,7 +41,7 @@ def check_load_arguments(
     unknown = [name for name in arguments if name not in own | parameters]
     if not unknown:
         return
-    saved_names = saved_attribute_names(saved)
+    saved_names = saved_attributes(saved).keys()
     if not saved_names:
         return
     attributes = saved_names | _attributes(algorithm)
@@ -65,19 +65,9 @@ def misspelt_custom_objects(saved: SavedModel, names: Iterable[str]) -> dict[str
     :param names: the names of the custom objects
     :return: the nearest name of an attribute, by the custom object's name
     """
-    attributes = saved_attribute_names(saved)
+    attributes = saved_attributes(saved)
     found = {name: nearest(name, attributes, cutoff=0.85) for name in names if name not in attributes}
     return {name: similar for name, similar in found.items() if similar is not None} if attributes else {}
-
-
-def saved_attribute_names(saved: SavedModel) -> set[str]:
-    """
-    Return the names of the attributes that a saved model holds, without unpickling it.
-
-    :param saved: the path of the saved model, or an open file, whose position is restored
-    :return: the names; none for a file that ``load`` refuses, with an error of its own
-    """
-    return set(saved_attributes(saved))
 
 
 def saved_attributes(saved: SavedModel) -> dict[str, Any]:

@@ -110,8 +110,7 @@ class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
         :return: the model
         :raises IsADirectoryError: if the path is a folder without a zip-file of the same name beside it
         :raises TypeError: if a model has no such argument or attribute, naming it and the nearest one that is allowed
-        :raises ValueError: if the value of an argument of SB3's is wrong, naming it, or if the file holds a population and the
-            class is that of one agent, or the reverse
+        :raises ValueError: if the value of an argument of SB3's is wrong, naming it
         """
         path = find_file(cls, path, "zip")
         kwargs = effective_load_arguments(cls, path, device, custom_objects, kwargs)

@@ -10,15 +10,13 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EventCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cgp.common.load_arguments import SavedModel, check_load_arguments, misspelt_custom_objects, saved_attribute_names
+from sb3_cgp.common.load_arguments import SavedModel, check_load_arguments, misspelt_custom_objects
 from sb3_cgp.common.rules import as_count, require
-from sb3_cgp.common.sb3_arguments import check_train_freq, constructor_argument_names
+from sb3_cgp.common.sb3_arguments import check_train_freq
 from sb3_cgp.guards.construction import check_constructor_arguments
 
 # The attributes in which SB3's classes hold other callbacks
 SLOTS = {CallbackList: "callbacks", EventCallback: "callback", EvalCallback: "callback_on_new_best"}
-# Arguments that populations of agents have, and no other algorithm has
-POPULATION_ARGUMENTS = {"agents", "overlap"}
 # The beginning of SB3's error for other policy_kwargs than the saved ones, and what to do about it
 OTHER_POLICY_KWARGS = "The specified policy kwargs do not equal"
 LEAVE_POLICY_KWARGS_OUT = (
@@ -69,10 +67,8 @@ def effective_load_arguments(
     :param given: the arguments to change in the model
     :return: those that have an effect, by the names that SB3 has for them
     :raises TypeError: if a model has no such argument or attribute, naming it and the nearest one that is allowed
-    :raises ValueError: if the value of an argument of SB3's is wrong, naming it, or if the file holds a population and the
-        class is that of one agent, or the reverse
+    :raises ValueError: if the value of an argument of SB3's is wrong, naming it
     """
-    check_holds(algorithm, saved)
     check_load_arguments(algorithm, saved, given)
     check_constructor_arguments(given | {"device": device})
     effective = dict(given)
@@ -103,26 +99,6 @@ def explaining_policy_kwargs() -> Iterator[None]:
         if not str(error).startswith(OTHER_POLICY_KWARGS):
             raise
         raise ValueError(f"{error} {LEAVE_POLICY_KWARGS_OUT}") from error
-
-
-def check_holds(algorithm: type[OffPolicyAlgorithm], saved: SavedModel) -> None:
-    """
-    Check that a saved model is a population if the algorithm trains one, and else is none.
-
-    :param algorithm: the algorithm's class
-    :param saved: the path of the saved model, or an open file; a file that cannot be read is left to ``load``
-    :raises ValueError: if it is the other
-    """
-    attributes = saved_attribute_names(saved)
-    is_population = attributes >= POPULATION_ARGUMENTS
-    takes_population = constructor_argument_names(algorithm) >= POPULATION_ARGUMENTS
-    if not attributes or is_population == takes_population:
-        return
-    found, remedy = "without the attribute `agents`", "a single agent is loaded by its own class, such as `CGP.load(path)`"
-    if is_population:
-        found, remedy = "with the attribute `agents`", "load a population by `sb3_cgp.population.Population.load(path)`"
-    allowed = f"of {algorithm.__name__}, which {'trains a population' if takes_population else 'is a single agent'}: {remedy}"
-    require(False, "path", f"a file {found}", allowed)
 
 
 def check_callback(name: str, value: Any) -> None:

@@ -247,12 +247,17 @@ class Population(ResumableAlgorithm, PopulationMembers):
         :param args: the further parameters of SB3's ``load``
         :param kwargs: the same by keyword
         :return: the population
-        :raises ValueError: if an argument of the agents is given, which a saved population has for each of them
+        :raises ValueError: if an argument of the agents is given, which a saved population has for each of them, or the file
+            holds a single agent
         :raises TypeError: if a population has no such argument or attribute, naming it and the nearest one that is allowed
         """
         for name in {"agents", *OWN, *COMMON} & kwargs.keys():
             require(name in ("verbose", "tensorboard_log"), name, kwargs[name], "left out: change it in a new population")
         path = find_file(cls, path, "zip")
+        saved = saved_attributes(path)
+        allowed = f"of {cls.__name__}, a population: load a single agent by its own class, such as `CGP.load(path)`"
+        # `load` refuses a file without any
+        require(not saved or "_agent_updates" in saved, "path", "a file without the attribute `agents`", allowed)
         return super().load(path, cls._make_env(env, path), *args, **kwargs)
 
     @classmethod
