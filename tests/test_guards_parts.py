@@ -115,6 +115,15 @@ def test_a_replay_buffer_of_other_environments_is_refused_and_the_models_own_kep
     model.learn(12)
 
 
+def test_a_replay_buffer_against_the_arguments_is_refused_in_any_algorithm_and_the_models_own_kept(tmp_path):
+    make_model(n_steps=3).learn(12).save_replay_buffer(tmp_path / "buffer")
+    model = make_model().learn(12)
+    own = model.replay_buffer
+    with pytest.raises(ValueError, match="`replay_buffer` is 'NStepReplayBuffer', but must be a ReplayBuffer, by the model's"):
+        model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer is own
+
+
 def test_a_model_that_is_loaded_with_other_environments_refuses_its_old_buffer(tmp_path):
     model = make_model(2).learn(12)
     model.save(tmp_path / "model")

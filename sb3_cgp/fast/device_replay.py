@@ -67,6 +67,8 @@ class DeviceReplayBuffer(ReplayBuffer):
     :raises ValueError: if ``optimize_memory_usage`` is set or the observation space is not a ``Box``
     """
 
+    # The class in whose place a model has this one
+    stands_for = ReplayBuffer
     # The fields that a training state holds
     row_fields = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
     observations = _stored("observations")

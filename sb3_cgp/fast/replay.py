@@ -12,11 +12,9 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_cgp.common.replay_buffers import is_ours, stores_as_given
-from sb3_cgp.common.rules import require
+from sb3_cgp.common.replay_buffers import stores_as_given
 from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer, fits_device, leaves_room
 
@@ -136,40 +134,6 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
             # A loaded buffer has those of the model that saved it
             buffer.n_steps, buffer.gamma = self.n_steps, self.gamma
         return super()._setup_learn(*args, **kwargs)
-
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        """
-        Load a replay buffer from a pickle file, as SB3 does, if it is what the model's arguments ask for.
-
-        :param path: Path to the pickled replay buffer.
-        :param truncate_last_traj: When using ``HerReplayBuffer`` with online sampling: whether the last trajectory in the
-            replay buffer was finished
-        :raises ValueError: if the buffer contradicts ``replay_buffer_class``, ``n_steps``, ``optimize_memory_usage`` or
-            ``replay_buffer_kwargs``; the model keeps its own
-        """
-        previous = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        assert self.replay_buffer is not None
-        try:
-            self._check_loaded(self.replay_buffer)
-        except ValueError:
-            self.replay_buffer = previous
-            raise
-
-    def _check_loaded(self, buffer: ReplayBuffer) -> None:
-        """Refuse a loaded buffer whose settings contradict the model's arguments, which it would outrank silently."""
-        asked = replay_buffer_class_of(self)
-        kinds = [ReplayBuffer if each is DeviceReplayBuffer else each for each in (type(buffer), asked)]
-        # A class of the user's own may do what the arguments ask for
-        fits = kinds[0] is kinds[1] or not all(map(is_ours, kinds))
-        allowed = f"a {asked.__name__}, by the model's `replay_buffer_class`, `n_steps` and observation space"
-        require(fits, "replay_buffer", type(buffer).__name__, f"{allowed}: load the model with those of the saved one")
-        # A class of the user's own may change its arguments along the training
-        kwargs = self.replay_buffer_kwargs if is_ours(kinds[0]) else {}
-        for name, value in {"optimize_memory_usage": self.optimize_memory_usage, **kwargs}.items():
-            stored = getattr(buffer, name, value)
-            value = KEY_TO_GOAL_STRATEGY.get(value.lower(), value) if isinstance(value, str) else value
-            require(stored == value, f"replay_buffer.{name}", stored, f"{value}, as in the model's arguments")
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """

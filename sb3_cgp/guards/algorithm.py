@@ -28,6 +28,7 @@ from sb3_cgp.guards.networks import check_goals, check_observation_space, try_ne
 from sb3_cgp.guards.normalisation import NormalisationGuard, check_wrappers
 from sb3_cgp.guards.parts import (
     check_action_noise,
+    check_loaded_replay_buffer,
     check_replay_buffer,
     check_replay_buffer_kwargs,
     fit_action_noise,
@@ -136,13 +137,14 @@ class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
         :param truncate_last_traj: When using ``HerReplayBuffer`` with online sampling: whether the last trajectory in the
             replay buffer was finished. With False, it is continued where the environment is still at its end.
         :raises IsADirectoryError: if the path is a folder without a pickle file of the same name beside it
-        :raises ValueError: if the buffer is of other spaces or of another number of environments than the model
+        :raises ValueError: if the buffer contradicts an argument of the model, or is of other spaces or of another number of
+            environments
         """
         previous = self.replay_buffer
         super().load_replay_buffer(find_file(type(self), path, "pkl"), truncate_last_traj)
         assert self.replay_buffer is not None
         try:
-            check_replay_buffer(self.replay_buffer, self)
+            check_loaded_replay_buffer(self.replay_buffer, self)
         except ValueError:
             self.replay_buffer = previous
             raise

@@ -13,8 +13,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_cgp.common.replay_buffers import stores_as_given
+from sb3_cgp.common.replay_buffers import is_ours, stores_as_given
 from sb3_cgp.common.rules import require
+from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
 from sb3_cgp.common.spaces import have_same_layout
 from sb3_cgp.guards.names import check_names
 
@@ -82,6 +83,30 @@ def check_replay_buffer_kwargs(buffer_class: type[ReplayBuffer], given: Mapping[
         allowed = f"one of {', '.join(map(repr, KEY_TO_GOAL_STRATEGY))}"
         is_known = strategy.lower() in KEY_TO_GOAL_STRATEGY
         require(is_known, "replay_buffer_kwargs['goal_selection_strategy']", strategy, allowed)
+
+
+def check_loaded_replay_buffer(buffer: ReplayBuffer, model: OffPolicyAlgorithm) -> None:
+    """
+    Check that a loaded replay buffer fits a model and its arguments, which the buffer's settings would outrank silently.
+
+    :param buffer: the replay buffer
+    :param model: the model
+    :raises ValueError: if the buffer contradicts ``replay_buffer_class``, ``n_steps``, ``optimize_memory_usage`` or
+        ``replay_buffer_kwargs``, or is of other spaces or of another number of environments
+    """
+    asked = replay_buffer_class_of(model)
+    kinds = [vars(each).get("stands_for", each) for each in (type(buffer), asked)]
+    # A class of the user's own may do what the arguments ask for
+    fits = kinds[0] is kinds[1] or not all(map(is_ours, kinds))
+    allowed = f"a {asked.__name__}, by the model's `replay_buffer_class`, `n_steps` and observation space"
+    require(fits, "replay_buffer", type(buffer).__name__, f"{allowed}: load the model with those of the saved one")
+    # A class of the user's own may change its arguments along the training
+    kwargs = model.replay_buffer_kwargs if is_ours(kinds[0]) else {}
+    for name, value in {"optimize_memory_usage": model.optimize_memory_usage, **kwargs}.items():
+        stored = getattr(buffer, name, value)
+        value = KEY_TO_GOAL_STRATEGY.get(value.lower(), value) if isinstance(value, str) else value
+        require(stored == value, f"replay_buffer.{name}", stored, f"{value}, as in the model's arguments")
+    check_replay_buffer(buffer, model)
 
 
 def check_replay_buffer(buffer: ReplayBuffer, model: OffPolicyAlgorithm) -> None:
