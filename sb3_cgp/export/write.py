@@ -17,7 +17,7 @@ from sb3_cgp.common.extras import import_from_extra
 from sb3_cgp.common.files import replace_all
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.spaces import sample_of
-from sb3_cgp.common.statistics import WITH_STATISTICS, count_observations
+from sb3_cgp.common.vec_normalize import WITH_STATISTICS, has_new_statistics, normalises
 from sb3_cgp.common.version import __version__
 from sb3_cgp.export.boxes import (
     KEYS_ALLOWED,
@@ -110,21 +110,17 @@ def export_policy(model: ExportableModel, folder: str | Path) -> None:
 def _normalizer(model: ExportableModel) -> VecNormalize | None:
     """Return the wrapper that normalises the observations, or None if they are not normalised."""
     normalizer = model.get_vec_normalize_env()
-    normalizes = normalizer is not None and normalizer.norm_obs
     require(
-        normalizes or not model._learnt_normalized,
+        normalises(normalizer) or not model._learnt_normalized,
         "env",
         model.env,
         "wrapped in VecNormalize with its statistics, as the environment was that the model learnt from: "
         f"{WITH_STATISTICS} or `set_env` before exporting",
     )
-    if not normalizes:
+    if not normalises(normalizer):
         return None
-    assert normalizer is not None
-    # Without a bound, new statistics leave observations as they are, as may be intended
-    is_new = count_observations(normalizer) < 1.0 and bool(np.isfinite(normalizer.clip_obs))
     allowed = f"one with the statistics that were saved with the model, not new ones: {WITH_STATISTICS}"
-    require(not is_new or not model._learnt_normalized, "env", model.env, allowed)
+    require(not has_new_statistics(normalizer) or not model._learnt_normalized, "env", model.env, allowed)
     space = normalizer.venv.observation_space
     require(
         space == model.observation_space,

@@ -16,6 +16,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cgp.common.replay_buffers import stores_as_given
 from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
+from sb3_cgp.common.vec_normalize import normalises
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer, fits_device, leaves_room
 
 SelfLeanReplayAlgorithm = TypeVar("SelfLeanReplayAlgorithm", bound="LeanReplayAlgorithm")
@@ -107,13 +108,7 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
 
     def _stored_space(self) -> spaces.Space:
         """Return the observation space with the data types in which observations are stored."""
-        return self.observation_space if self._is_normalized else float32_space(self.observation_space)
-
-    @property
-    def _is_normalized(self) -> bool:
-        """Whether the environment normalises observations."""
-        normalizer = self.get_vec_normalize_env()
-        return normalizer is not None and normalizer.norm_obs
+        return self.observation_space if normalises(self._vec_normalize_env) else float32_space(self.observation_space)
 
     def _chooses_n_step_returns(self, buffer_class: type[ReplayBuffer]) -> bool:
         """Return whether the model's ``n_steps`` and ``gamma`` are the buffer's, as where the user gave no class."""
@@ -125,7 +120,7 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         if buffer is not None and buffer.observation_space != space:
             if buffer.size() == 0 and buffer.observation_space == self._allocated_for:
                 self.replay_buffer = None
-            elif self._is_normalized and stores_as_given(type(buffer)):
+            elif normalises(self._vec_normalize_env) and stores_as_given(type(buffer)):
                 message = "The replay buffer stores observations in float32, and `env` normalises them now: those near their"
                 warnings.warn(f"{message} mean may lose their differences. Train a new model to keep these.", stacklevel=2)
         buffer = self._ensure_replay_buffer()

@@ -8,7 +8,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, VecTransposeImage, unwrap_vec_normalize
 
 from sb3_cgp.common.spaces import by_key, have_same_layout
-from sb3_cgp.common.statistics import WITH_STATISTICS, count_observations
+from sb3_cgp.common.vec_normalize import WITH_STATISTICS, count_observations, has_new_statistics, normalises
 
 
 class NormalisationGuard(OffPolicyAlgorithm):
@@ -44,13 +44,8 @@ class NormalisationGuard(OffPolicyAlgorithm):
             # Not earlier, as a callback restores the statistics of a resumed training when its first rollout starts
             self._has_checked_statistics = True
             self._warn_of_new_statistics()
-        self._learnt_normalized = self._normalises
+        self._learnt_normalized = normalises(self._vec_normalize_env)
         super().train(*args, **kwargs)
-
-    @property
-    def _normalises(self) -> bool:
-        """Whether the observations that the networks are given now are normalised."""
-        return self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
 
     def _check_normalisation(self) -> None:
         """
@@ -58,14 +53,15 @@ class NormalisationGuard(OffPolicyAlgorithm):
 
         :raises ValueError: if they are not
         """
-        if self._learnt_normalized and not self._normalises:
+        is_normalized = normalises(self._vec_normalize_env)
+        if self._learnt_normalized and not is_normalized:
             raise ValueError(
                 f"The value of `env` is {self.env!r}, but must normalise observations, as the model has learnt from "
                 f"normalised ones: use {WITH_STATISTICS}, or `set_env`, with the statistics "
                 "that were saved with the model. If raw observations are intended, use `VecNormalize(env, training=False, "
                 "clip_obs=float('inf'))`, whose new statistics leave observations as they are."
             )
-        if self._learnt_normalized is False and self._normalises:
+        if self._learnt_normalized is False and is_normalized:
             warnings.warn(
                 "The model has learnt from observations that were not normalised, and `env` normalises them now "
                 "(`VecNormalize` with `norm_obs=True`): the networks see other values than before. Use `norm_obs=False`, or "
@@ -76,15 +72,12 @@ class NormalisationGuard(OffPolicyAlgorithm):
     def _warn_of_new_statistics(self) -> None:
         """Warn if the statistics of the observations know those of this training alone, and those of the model do not."""
         normalizer = self._vec_normalize_env
-        if not self._learnt_normalized or normalizer is None or not normalizer.norm_obs:
+        if not self._learnt_normalized or not normalises(normalizer):
             return
-        count = count_observations(normalizer)
-        if normalizer.training:
-            # The steps of this training, its reset, and SB3's initial count
-            is_new = count <= self.num_timesteps - self._num_timesteps_at_start + self.n_envs + 1e-3
-        else:
-            # Saved statistics have counted. New ones without a bound are the identity, which the error above advises.
-            is_new = count < 1 and bool(np.isfinite(normalizer.clip_obs))
+        # The steps of this training, its reset, and SB3's initial count
+        n_own = self.num_timesteps - self._num_timesteps_at_start + self.n_envs + 1e-3
+        # Saved statistics have counted
+        is_new = count_observations(normalizer) <= n_own if normalizer.training else has_new_statistics(normalizer)
         if is_new:
             warnings.warn(
                 "The model has learnt from normalised observations, and the `VecNormalize` of `env` has new statistics: the "
