@@ -20,16 +20,16 @@ from sb3_cgp.export.read import ExportedPolicy, load_weights
 from sb3_cgp.export.write import export_policy
 from sb3_cgp.fast.cuda_graph_algorithm import CudaGraphAlgorithm
 from sb3_cgp.fast.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
-from sb3_cgp.fast.replay import LeanReplayAlgorithm
+from sb3_cgp.fast.replay_algorithm import LeanReplayAlgorithm
 from sb3_cgp.fast.scoring_algorithm import ScoringAlgorithm
 from sb3_cgp.guards.algorithm import GuardedAlgorithm
+from sb3_cgp.guards.argument_names import suggests_names
 from sb3_cgp.guards.arguments import check_callback
 from sb3_cgp.guards.construction import checks_arguments
 from sb3_cgp.guards.explanations import explaining_errors
+from sb3_cgp.guards.file_names import find_file
 from sb3_cgp.guards.losses import LossGuard
-from sb3_cgp.guards.names import suggests_names
-from sb3_cgp.guards.parts import fit_replay_buffer
-from sb3_cgp.guards.paths import find_file
+from sb3_cgp.guards.replay_buffer_fit import fit_replay_buffer
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
 
 SelfCGP = TypeVar("SelfCGP", bound="CGP")

@@ -16,7 +16,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cgp import CGP
 from sb3_cgp.common.spaces import check_action_space
-from sb3_cgp.guards.parts import check_replay_buffer
+from sb3_cgp.guards.replay_buffer_fit import check_replay_buffer
 
 pytestmark = pytest.mark.filterwarnings("ignore:Nothing is learnt")
 

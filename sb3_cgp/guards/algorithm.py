@@ -17,24 +17,23 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
 from sb3_cgp.common.spaces import check_action_space
+from sb3_cgp.guards.action_noise import check_action_noise, fit_action_noise
 from sb3_cgp.guards.arguments import check_learn_arguments, effective_load_arguments, explaining_policy_kwargs
 from sb3_cgp.guards.construction import check_env, check_policy_and_env, check_policy_name, explaining_policy
-from sb3_cgp.guards.contents import check_contents
 from sb3_cgp.guards.dummy_vec_env import observing_environments
 from sb3_cgp.guards.episodes import EpisodeGuard
 from sb3_cgp.guards.explanations import explaining_errors
+from sb3_cgp.guards.file_names import find_file
 from sb3_cgp.guards.learning_starts import LearningStartsGuard
 from sb3_cgp.guards.networks import check_goals, check_observation_space, try_networks
 from sb3_cgp.guards.normalisation import NormalisationGuard, check_wrappers
-from sb3_cgp.guards.parts import (
-    check_action_noise,
+from sb3_cgp.guards.replay_buffer_fit import (
     check_loaded_replay_buffer,
     check_replay_buffer,
     check_replay_buffer_kwargs,
-    fit_action_noise,
     fit_replay_buffer,
 )
-from sb3_cgp.guards.paths import find_file
+from sb3_cgp.guards.replay_buffer_values import check_contents
 from sb3_cgp.guards.seeds import warning_of_missing_seed
 from sb3_cgp.guards.transitions import TransitionGuard
 from sb3_cgp.guards.workers import discard_replies, watching_workers

@@ -19,7 +19,7 @@ from torch import nn
 
 from sb3_cgp.common.rules import nearest, require, require_count
 from sb3_cgp.common.sb3_arguments import constructor_argument_names
-from sb3_cgp.guards.names import ELSEWHERE, LEAVE_OUT, check_names, naming_policy_argument
+from sb3_cgp.guards.argument_names import ELSEWHERE, LEAVE_OUT, check_names, naming_policy_argument
 
 P = ParamSpec("P")
 T = TypeVar("T")

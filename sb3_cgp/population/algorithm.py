@@ -15,9 +15,9 @@ from sb3_cgp.common.load_arguments import saved_attributes
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import as_schedule
 from sb3_cgp.core.policies import CGPPolicy
-from sb3_cgp.guards.names import suggests_names
+from sb3_cgp.guards.argument_names import suggests_names
+from sb3_cgp.guards.file_names import find_file
 from sb3_cgp.guards.observations import innermost
-from sb3_cgp.guards.paths import find_file
 from sb3_cgp.population.arguments import (
     COMMON,
     OWN,

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_cgp.fast.cuda_graphs import RecordedFunction, Tensors, has_cuda_graphs
 from sb3_cgp.fast.recorded_optimizers import CHECK_INTERVAL, LOSSES
-from sb3_cgp.fast.replay import LeanReplayAlgorithm
+from sb3_cgp.fast.replay_algorithm import LeanReplayAlgorithm
 from sb3_cgp.guards.algorithm import CommonGuards
 from sb3_cgp.population.arguments import Arguments, value_of
 from sb3_cgp.population.gradient_step import AgentNumbers, GradientStep

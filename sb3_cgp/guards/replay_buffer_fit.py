@@ -1,14 +1,10 @@
-"""Parts of a model that do not fit together: replay buffers and action noise of other environments."""
+"""Replay buffers that do not fit a model: of other environments, or against its arguments."""
 
-import copy
 import inspect
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
@@ -17,7 +13,7 @@ from sb3_cgp.common.replay_buffers import is_ours, stores_as_given
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
 from sb3_cgp.common.spaces import have_same_layout
-from sb3_cgp.guards.names import check_names
+from sb3_cgp.guards.argument_names import check_names
 
 # The arguments of a replay buffer that the algorithm gives
 GIVEN_BY_MODEL = {"buffer_size", "observation_space", "action_space", "device", "n_envs", "optimize_memory_usage", "env"}
@@ -32,38 +28,6 @@ def fit_replay_buffer(model: OffPolicyAlgorithm) -> None:
     if isinstance(model.replay_buffer, HerReplayBuffer) and model.env is not None:
         # `HerReplayBuffer.set_env` refuses a second environment
         model.replay_buffer.env = model.env
-
-
-def fit_action_noise(model: OffPolicyAlgorithm) -> None:
-    """
-    Adapt vectorised action noise to the number of environments, which `load` may have changed.
-
-    :param model: the model, with an environment
-    """
-    assert model.env is not None
-    noise, n_envs = model.action_noise, model.env.num_envs
-    if not isinstance(noise, VectorizedActionNoise) or len(noise.noises) == n_envs:
-        return
-    base = copy.deepcopy(noise.base_noise)
-    model.action_noise = base if n_envs == 1 else VectorizedActionNoise(base, n_envs)
-
-
-def check_action_noise(noise: Any, action_space: spaces.Space) -> None:
-    """
-    Check that exploration noise is such, and can be added to an action.
-
-    :param noise: the argument ``action_noise``; the shape of noise of another class than SB3's is not checked
-    :param action_space: the action space
-    :raises ValueError: if it is neither None nor action noise, or of another shape
-    """
-    allowed = "None or an ActionNoise, such as NormalActionNoise(np.zeros(n), 0.1 * np.ones(n)) for n action dimensions"
-    require(isinstance(noise, ActionNoise | None), "action_noise", noise, allowed)
-    base = noise.base_noise if isinstance(noise, VectorizedActionNoise) else noise
-    for name in ("_mu", "_sigma"):
-        # SB3 gives no public access to the mean and the standard deviation
-        shape = np.shape(getattr(base, name, 0.0))
-        allowed = f"noise of the actions' shape, {action_space.shape}, not {shape}"
-        require(_broadcasts_to(shape, action_space.shape or ()), "action_noise", noise, allowed)
 
 
 def check_replay_buffer_kwargs(buffer_class: type[ReplayBuffer], given: Mapping[str, Any]) -> None:
@@ -141,11 +105,3 @@ def check_replay_buffer(buffer: ReplayBuffer, model: OffPolicyAlgorithm) -> None
         buffer.action_space,
         f"the model's, {model.action_space}: load the buffer that was saved with the model, or begin with an empty one",
     )
-
-
-def _broadcasts_to(shape: tuple[int, ...], other: tuple[int, ...]) -> bool:
-    """Return whether NumPy broadcasts an array of a shape to another one."""
-    try:
-        return np.broadcast_shapes(shape, other) == other
-    except ValueError:
-        return False

@@ -11,7 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cgp import CGP
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer
-from sb3_cgp.guards.contents import ROWS, check_contents
+from sb3_cgp.guards.replay_buffer_values import ROWS, check_contents
 
 
 def filled(n_envs=1, algorithm=CGP, n=20, **arguments):

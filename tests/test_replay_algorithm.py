@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cgp import CGP
-from sb3_cgp.fast.replay import float32_space
+from sb3_cgp.fast.replay_algorithm import float32_space
 
 SMALL = dict(learning_starts=30, buffer_size=200, batch_size=8, cem_samples=8, cem_elites=2, seed=0, device="cpu")
 
@@ -70,7 +70,7 @@ VARIATIONS = {
 def test_training_is_the_same_to_the_bit_as_on_float64(monkeypatch, name):
     kwargs, buffer_class = VARIATIONS[name]
     narrow = make_model(Doubles(), **kwargs).learn(80)
-    monkeypatch.setattr("sb3_cgp.fast.replay.float32_space", lambda space: space)
+    monkeypatch.setattr("sb3_cgp.fast.replay_algorithm.float32_space", lambda space: space)
     wide = make_model(Doubles(), **kwargs).learn(80)
     assert narrow._n_updates == wide._n_updates == 50
     assert type(narrow.replay_buffer) is buffer_class
