@@ -225,6 +225,23 @@ def test_the_buffer_is_sb3s_own_for_whoever_loads_it(tmp_path):
     td3.learn(10)
 
 
+@pytest.mark.parametrize("algorithm", [TD3, CGP])
+def test_a_buffer_that_is_there_before_the_networks_is_kept(tmp_path, algorithm):
+    class WithBuffer(algorithm):
+        def _setup_model(self):
+            self.replay_buffer = ReplayBuffer(77, self.observation_space, self.action_space)
+            super()._setup_model()
+
+    arguments = dict(learning_starts=30, buffer_size=200, policy_kwargs=dict(net_arch=[8]))
+    assert WithBuffer("MlpPolicy", Doubles(), **arguments).replay_buffer.buffer_size == 77
+    model = algorithm("MlpPolicy", Doubles(), **arguments).learn(40)
+    model.save(tmp_path / "model", include=["replay_buffer"])
+    loaded = algorithm.load(tmp_path / "model", env=Doubles())
+    assert loaded.learn(5, reset_num_timesteps=False).replay_buffer.size() == 45
+    loaded = algorithm.load(tmp_path / "model", env=Doubles(), replay_buffer=model.replay_buffer)
+    assert loaded.replay_buffer is model.replay_buffer
+
+
 def test_a_buffer_that_was_saved_in_float64_still_trains(tmp_path):
     TD3("MlpPolicy", Doubles(), buffer_size=200, learning_starts=100).learn(60).save_replay_buffer(tmp_path / "buffer")
     model = make_model(Doubles())

@@ -62,10 +62,12 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         # SB3 stores its choices in the arguments, where they would outrank the arguments of a later `load`
         given = self.replay_buffer_class, self.replay_buffer_kwargs
         self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs)
+        # One that was saved within the model, or that a subclass has made
+        buffer = self.replay_buffer
         # SB3 allocates a buffer unless there is one, and asks for an environment to do so for hindsight replay
         self.replay_buffer = ReplayBuffer.__new__(ReplayBuffer)
         super()._setup_model()
-        self.replay_buffer = None
+        self.replay_buffer = buffer
         self.replay_buffer_class, self.replay_buffer_kwargs = given
         if not self._defers_replay_buffer:
             self._ensure_replay_buffer()
