@@ -11,6 +11,7 @@ import torch as th
 from guarded import ACTIONS, SMALL, GuardedTD3, Located, located
 from gymnasium import spaces
 from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
@@ -294,6 +295,12 @@ def test_rewards_of_goals_that_are_not_those_of_a_batch_are_refused(compute_rewa
     env = type("Goals", (Located,), dict(compute_reward=compute_reward))(goals=True)
     with pytest.raises(ValueError, match=r"`env.compute_reward` is .* must be able to return the rewards of a batch"):
         GuardedTD3("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, **SMALL)
+
+
+def test_goals_that_are_one_number_are_taken():
+    env = BitFlippingEnv(n_bits=3, continuous=True, max_steps=3, discrete_obs_space=True)
+    model = GuardedTD3("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, **SMALL)
+    assert model.learn(30)._n_updates > 0
 
 
 @pytest.mark.parametrize("error", [KeyError("x"), TypeError("float() argument must be a string or a real number")])

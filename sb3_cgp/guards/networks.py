@@ -62,9 +62,10 @@ def _try_rewards(model: OffPolicyAlgorithm) -> None:
     """Compute the rewards of two goals, as hindsight replay computes those of a batch."""
     assert model.env is not None
     assert isinstance(model.observation_space, spaces.Dict)
-    achieved, desired = (
-        np.zeros((2, *(model.observation_space[key].shape or ())), model.observation_space[key].dtype) for key in GOAL_KEYS[1:]
-    )
+    # As replay buffers store them: a `Discrete` goal has an axis more
+    shapes = get_obs_shape(model.observation_space)
+    assert isinstance(shapes, dict)
+    achieved, desired = (np.zeros((2, *shapes[key]), model.observation_space[key].dtype) for key in GOAL_KEYS[1:])
     try:
         rewards = model.env.env_method("compute_reward", achieved, desired, [{}, {}], indices=[0])[0]
         is_batch = np.shape(rewards) in ((2,), (2, 1))
