@@ -7,6 +7,7 @@ import warnings
 from collections import Counter, defaultdict, deque
 from dataclasses import dataclass, field
 
+import mujoco
 import numpy as np
 import pytest
 import torch as th
@@ -47,6 +48,14 @@ class Watch(BaseCallback):
         if self.counts_from is not None and self.num_timesteps >= self.counts_from:
             self.found = {"steps": [self.num_timesteps]}
         return True
+
+
+class Compiled(mujoco.MjOption, Watch, metaclass=type("Metaclass", (type(mujoco.MjOption), type(Watch)), {})):
+    """Derives from a class whose constructor, which is not written in Python, does not tell its arguments."""
+
+    def __init__(self, *args, **kwargs):
+        mujoco.MjOption.__init__(self)
+        Watch.__init__(self, *args, **kwargs)
 
 
 class Declaring(BaseCallback):
@@ -113,6 +122,7 @@ def missing(callback, folder, steps=60, **arguments):
         HParamsCallback(),
         Watch(),
         Watch(counts_from=1_000),
+        Compiled(),
         Declaring({}),
         Declaring(None),
         Declaring({"n_calls": 3, "num_timesteps": 3}),

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from environment_states import check, environment_state, obstacles
+from environments import Doubles
 from gymnasium import spaces
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from stable_baselines3.common.env_util import make_vec_env
@@ -195,6 +196,24 @@ def test_dm_controls_suite_through_shimmy_goes_on_to_the_bit(task):
 def test_gymnasium_robotics_goes_on_to_the_bit(task):
     pytest.importorskip("gymnasium_robotics", reason="gymnasium-robotics is not installed")
     check(partial(make_foreign, task))
+
+
+class Compiled(mujoco.MjOption, Doubles):
+    """Derives from a class whose constructor, which is not written in Python, does not tell its arguments."""
+
+    def __init__(self, *args, **kwargs):
+        mujoco.MjOption.__init__(self, *args, **kwargs)
+        self.steps = 0
+
+    def get_training_state(self):
+        return self.steps
+
+    def set_training_state(self, state):
+        self.steps = state
+
+
+def test_an_environment_whose_base_does_not_tell_its_arguments_goes_on_to_the_bit():
+    check(partial(make, Compiled), steps=13, then=22)
 
 
 class NoInfos(gym.Wrapper):

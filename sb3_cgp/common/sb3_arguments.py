@@ -22,6 +22,8 @@ def constructor_argument_names(of: type) -> set[str]:
     """
     Return the names of the arguments that a constructor takes, those that it passes on to its bases included.
 
+    A base that is not written in Python may not tell its arguments: it adds none.
+
     :param of: the class, such as that of an algorithm, a policy or an environment
     :return: the names
     """
@@ -30,7 +32,11 @@ def constructor_argument_names(of: type) -> set[str]:
     for base in of.__mro__:
         if "__init__" not in vars(base):
             continue
-        parameters = inspect.signature(vars(base)["__init__"]).parameters.values()
+        try:
+            parameters = inspect.signature(vars(base)["__init__"]).parameters.values()
+        except (TypeError, ValueError):
+            # Not written in Python, as those of simulators: its arguments have no names
+            continue
         own = {each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
         names |= own
         if len(own) == len(parameters):
