@@ -10,11 +10,11 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_cgp.common.replay_buffers import end_last_episode
+from sb3_cgp.common.transient import TransientAttributes
 from sb3_cgp.guards.observations import (
     continues_last_episode,
     count_envs,
@@ -25,7 +25,7 @@ from sb3_cgp.guards.observations import (
 )
 
 
-class EpisodeGuard(OffPolicyAlgorithm):
+class EpisodeGuard(TransientAttributes):
     """
     An algorithm that stores only steps that were made, and lets no episode of its replay buffer run into the next one.
 
@@ -34,6 +34,7 @@ class EpisodeGuard(OffPolicyAlgorithm):
     where a callback or an exception ended a training before the last step was stored.
     """
 
+    TRANSIENT = ("_is_in_rollout",)
     # Where the model's own last step, or its reset, left the environment; None where that is unknown, as after `load`
     _left_env_at: "_EnvMark | None" = None
     # The step of the training's own that is not stored yet
@@ -189,7 +190,7 @@ class EpisodeGuard(OffPolicyAlgorithm):
         return not same_observations(bare.buf_obs, self._original_last_obs)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_left_env_at", "_own_step", "_has_warned_of_moves", "_is_in_rollout"]
+        return [*super()._excluded_save_params(), "_left_env_at", "_own_step", "_has_warned_of_moves"]
 
 
 class _EnvMark(NamedTuple):
