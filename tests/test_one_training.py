@@ -124,7 +124,7 @@ def test_models_can_be_copied_whenever_those_of_td3_can(copied, tmp_path):
     callbacks = [TrainingCheckpointCallback(10, tmp_path), EvalCallback(env(), eval_freq=20, n_eval_episodes=1, verbose=0)]
     during = []
     model.learn(30, [*callbacks, Do(25, lambda: during.append(copy.deepcopy(model)))])
-    assert model.callback is None
+    assert model._training.callback is None
     assert during[0].num_timesteps == 25
     with pytest.raises(Interruption):
         model.learn(40, [Stop(35)], reset_num_timesteps=False)

@@ -107,7 +107,7 @@ class ResumableAlgorithm(ResumableModel):
         except BaseException:
             lock.release()
             raise
-        model._folder_locks = {store.folder: lock}
+        model._note_training(folder_locks={store.folder: lock})
         if model.verbose >= 1:
             print(f"Resuming the training in {path} at step {model.num_timesteps}")
         return model
@@ -223,14 +223,15 @@ class ResumableAlgorithm(ResumableModel):
         for bar in bars if self.resumption is not None else ():
             show_whole_training(bar, self)
         if self.resumption is not None and not checkpoints:
-            self._added_checkpoint = TrainingCheckpointCallback(**self.resumption["checkpoint"])
-        if self._added_checkpoint is not None and not checkpoints:
+            self._note_training(added_checkpoint=TrainingCheckpointCallback(**self.resumption["checkpoint"]))
+        added = self._training.added_checkpoint
+        if added is not None and not checkpoints:
             # Also in the offline training of a policy that follows, which saves a state at its end
-            self._added_checkpoint.init_callback(self)
-            callback = CallbackList([callback, self._added_checkpoint])
+            added.init_callback(self)
+            callback = CallbackList([callback, added])
             # Not initialised, as SB3 has initialised the first of them
             callback.model = self
-        self.callback = callback
+        self._note_training(callback=callback)
         return callback
 
     def learn(self: SelfResumableAlgorithm, *args: Any, **kwargs: Any) -> SelfResumableAlgorithm:
@@ -255,7 +256,7 @@ class ResumableAlgorithm(ResumableModel):
         :raises KeyboardInterrupt: after Ctrl-C
         :raises SystemExit: after SIGTERM
         """
-        asked = None if self._outer_signals is None else self._outer_signals.noted
+        asked = None if self._training.outer_signals is None else self._training.outer_signals.noted
         # With states, this rollout's start saves one and ends the training
         if asked is not None and all(each.path is None for each in self._checkpoints()):
             end_training(asked, f"The training was interrupted: {NO_STATE}")
@@ -269,10 +270,10 @@ class ResumableAlgorithm(ResumableModel):
         ``learn`` runs within it, and so must any other method that calls callbacks. Contexts may be nested. The outermost one
         also releases the folders of states, and removes the callbacks from the model.
         """
-        if self._n_nested_trainings == 0:
-            self._outer_signals = StopSignals.current()
-        self._n_nested_trainings += 1
-        outer_callback = self.callback
+        outer = self._training
+        if outer.n_nested == 0:
+            self._note_training(outer_signals=StopSignals.current())
+        self._note_training(n_nested=outer.n_nested + 1)
         try:
             yield
         except (Exception, SystemExit) as error:
@@ -291,20 +292,17 @@ class ResumableAlgorithm(ResumableModel):
             # The signal came during the last step or the saving of its state. The code after `learn` could take too long.
             self._stop_if_asked()
         finally:
-            self._n_nested_trainings -= 1
             for each in self._checkpoints():
                 each.release()
-            # None in the end: callbacks hold environments and files, many of which can be neither copied nor pickled
-            self.callback = outer_callback
-            if self._n_nested_trainings == 0:
-                self._warned_of = frozenset()
-                self._initial_callbacks = {}
-                self._outer_signals = self._added_checkpoint = None
-                self.release_folders()
+            self._note_training(n_nested=outer.n_nested, callback=outer.callback)
+            if outer.n_nested == 0:
+                # Callbacks, too, as they hold environments and files
+                self._forget_training()
 
     def _checkpoints(self) -> list[TrainingCheckpointCallback]:
         """Return the callbacks of the training in progress that save states."""
-        return [] if self.callback is None else checkpoints_among(self.callback)
+        callback = self._training.callback
+        return [] if callback is None else checkpoints_among(callback)
 
     @property
     def _is_interrupted(self) -> bool:

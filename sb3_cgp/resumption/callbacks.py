@@ -104,8 +104,7 @@ class TrainingCheckpointCallback(BaseCallback):
         is_another = not self._store.digests() <= known
         allowed = "a folder without the states of another training: continue that one by `resume`, or choose another folder"
         require(not is_another, "path", str(self.path), allowed)
-        assert self.model.callback is not None
-        self._saving = [each for each in checkpoints_among(self.model.callback) if each.path is not None]
+        self._saving = [each for each in checkpoints_among(self._all_callbacks) if each.path is not None]
         self.signals.watch()
 
     def _on_rollout_start(self) -> None:
@@ -167,25 +166,30 @@ class TrainingCheckpointCallback(BaseCallback):
         """
         self.n_calls, self.num_timesteps = state["n_calls"], state["num_timesteps"]
 
+    @property
+    def _all_callbacks(self) -> BaseCallback:
+        """The training's callbacks, this one among them."""
+        callback = self.model._training.callback
+        assert callback is not None
+        return callback
+
     def _note_callbacks(self) -> None:
         """Note the attributes of all callbacks, once they have been told that the training starts."""
         if self.path is not None and not self._has_noted_callbacks:
             self._has_noted_callbacks = True
-            assert self.model.callback is not None
             # A policy's offline training begins with callbacks that have counted
-            self.model._initial_callbacks = initial_attributes(self.model.callback) | dict(self.model._initial_callbacks)
+            noted = initial_attributes(self._all_callbacks) | dict(self.model._training.initial_callbacks)
+            self.model._note_training(initial_callbacks=noted)
 
     def _restore_if_resumed(self) -> None:
         if self.model.resumption is not None:
-            assert self.model.callback is not None
-            restore(self.model, self.model.callback, self.model.resumption)
+            restore(self.model, self._all_callbacks, self.model.resumption)
             self.model.resumption = None
             self._saved_at = self.num_timesteps = self.model.num_timesteps
 
     def _save(self) -> None:
         settings = {"save_freq": self.save_freq, "keep": self.keep, "verbose": self.verbose}
-        assert self.model.callback is not None
-        state = gather(self.model, self.model.callback)
+        state = gather(self.model, self._all_callbacks)
         self._store.save(self.num_timesteps, state | {"checkpoint": settings})
         self._saved_at = self.num_timesteps
         self.model.saved_to = {**self.model.saved_to, self._folder: self._store.digests()}
@@ -195,7 +199,7 @@ class TrainingCheckpointCallback(BaseCallback):
     @property
     def noted_signal(self) -> int | None:
         """The signal that asks this training to end, or the one in one of whose callbacks it runs; None without one."""
-        outer = self.model._outer_signals
+        outer = self.model._training.outer_signals
         return outer.noted if self.signals.noted is None and outer is not None else self.signals.noted
 
     def stop_if_asked(self) -> None:
@@ -215,7 +219,7 @@ class TrainingCheckpointCallback(BaseCallback):
     @property
     def _kept_state(self) -> str:
         """The state that an interrupted training has, or the remedy."""
-        if self._has_stepped and not self._is_in_rollouts and self.model._n_nested_trainings == 1:
+        if self._has_stepped and not self._is_in_rollouts and self.model._training.n_nested == 1:
             # Not by `learn`, which saves the state at the start, and repeats this training
             return "`train_policy` saves no state before its end; call it again to go on from the actor as it is"
         return f"its state of step {self._saved_at} is in {self.path}; `resume` continues it" if self.has_state else NO_STATE

@@ -1,51 +1,60 @@
 """The attributes of a model that describe its running training. The callback that saves training states uses them."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_cgp.common.transient import TransientAttributes
 from sb3_cgp.resumption.callback_states import Start
 from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.signals import StopSignals
 
 State = dict[str, Any]
-# The attributes below, which describe a running training and are not part of SB3's zip
-UNSAVED = (
-    *("callback", "resumption", "saved_to", "_folder_locks", "_n_nested_trainings", "_warned_of", "_initial_callbacks"),
-    *("_outer_signals", "_added_checkpoint"),
-)
-# Those that a copy does not have, as it does not take part in the running training
-UNCOPIED = ("callback", "_folder_locks", "_initial_callbacks", "_outer_signals", "_added_checkpoint")
 
 
-class ResumableModel(OffPolicyAlgorithm):
+@dataclass(frozen=True)
+class RunningTraining:
+    """
+    What a model has while it trains, and after ``resume``. The values without a training are the defaults.
+
+    :param callback: the training's callbacks
+    :param initial_callbacks: their attributes at the training's start, by `id`
+    :param added_checkpoint: the callback that saves states in a resumed training without one among its callbacks
+    :param folder_locks: the locks that the training holds
+    :param n_nested: a policy's offline training may run within `learn`
+    :param outer_signals: the signals of the training in one of whose callbacks this one runs
+    :param warned_of: the warnings about the training state that were given
+    """
+
+    callback: BaseCallback | None = None
+    initial_callbacks: Mapping[int, Start] = field(default_factory=dict)
+    added_checkpoint: BaseCallback | None = None
+    folder_locks: Mapping[Path, FolderLock] = field(default_factory=dict)
+    n_nested: int = 0
+    outer_signals: StopSignals | None = None
+    warned_of: frozenset[str] = frozenset()
+
+
+class ResumableModel(TransientAttributes):
     """The attributes and methods of a model whose training states can be saved."""
 
-    # The callbacks of the training that is running
-    callback: BaseCallback | None = None
-    # The attributes of the callbacks at the training's start, by `id`
-    _initial_callbacks: Mapping[int, Start] = MappingProxyType({})
+    TRANSIENT = ("_training",)
+    _training = RunningTraining()
     # The loaded state, until the next `learn` has restored it
     resumption: State | None = None
     # The digests of the states' manifests in each folder that holds states of this training
     saved_to: Mapping[Path, frozenset[str]] = MappingProxyType({})
     # `num_timesteps` at the start of the last call of `learn`
     _training_started_at: int = 0
-    # The locks that this training holds
-    _folder_locks: Mapping[Path, FolderLock] = MappingProxyType({})
-    # A policy's offline training may run within `learn`
-    _n_nested_trainings: int = 0
-    # The callback that saves states in a resumed training without one among its callbacks
-    _added_checkpoint: BaseCallback | None = None
-    # The signals of the training in one of whose callbacks this one runs
-    _outer_signals: StopSignals | None = None
-    # The warnings about the training state that were given in this training
-    _warned_of: frozenset[str] = frozenset()
+
+    def _note_training(self, **changes: Any) -> None:
+        """Change what is known of the running training."""
+        self._training = replace(self._training, **changes)
 
     def get_training_state(self) -> State:
         """
@@ -75,17 +84,17 @@ class ResumableModel(OffPolicyAlgorithm):
         :param folder: the folder, as an absolute path
         :raises FolderInUseError: if another training holds it
         """
-        held = self._folder_locks.get(folder)
+        held = self._training.folder_locks.get(folder)
         if held is None or not held.is_ours:
             lock = FolderLock(folder)
             lock.acquire()
-            self._folder_locks = {**self._folder_locks, folder: lock}
+            self._note_training(folder_locks={**self._training.folder_locks, folder: lock})
 
-    def release_folders(self) -> None:
-        """Release all folders of training states that the model holds."""
-        for lock in self._folder_locks.values():
+    def _forget_training(self) -> None:
+        """Release all folders of training states that the model holds, and forget the training."""
+        for lock in self._training.folder_locks.values():
             lock.release()
-        self._folder_locks = {}
+        self._training = RunningTraining()
 
     def _ensure_replay_buffer(self) -> ReplayBuffer:
         """Return the replay buffer, which SB3's algorithms allocate in their constructor and in `load`."""
@@ -95,12 +104,5 @@ class ResumableModel(OffPolicyAlgorithm):
         assert self.replay_buffer is not None
         return self.replay_buffer
 
-    def __getstate__(self) -> State:
-        # Python has a method of this name since 3.11
-        inherited = getattr(super(), "__getstate__", None)
-        state = vars(self) if inherited is None else inherited()
-        kept = {name: value for name, value in state.items() if name not in UNCOPIED}
-        return kept | {"_n_nested_trainings": 0}
-
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), *UNSAVED]
+        return [*super()._excluded_save_params(), "resumption", "saved_to"]

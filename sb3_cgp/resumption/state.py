@@ -46,14 +46,14 @@ def gather(model: ResumableModel, callback: BaseCallback) -> State:
     model.save(zipped)
     normalizer = model.get_vec_normalize_env()
     environment, obstacles = state_and_obstacles(model.env)
-    callbacks, problems = callback_states(callback, model.env, model._initial_callbacks)
+    callbacks, problems = callback_states(callback, model.env, model._training.initial_callbacks)
     if obstacles:
         consequence = "A resumed training will continue at the start of a new episode, unlike an uninterrupted one."
         problems.insert(0, f"The environment's state cannot be saved. {' '.join(obstacles)} {consequence}")
     for message in problems:
-        if message not in model._warned_of:
+        if message not in model._training.warned_of:
             warnings.warn(message, stacklevel=2)
-    model._warned_of |= set(problems)
+    model._note_training(warned_of=model._training.warned_of | set(problems))
     return {
         "algorithm": type(model).__name__,
         "n_envs": model.n_envs,
