@@ -60,13 +60,13 @@ def test_a_training_state_has_the_losses_of_recorded_steps_in_its_log(stand_in):
     model.logger.name_to_value.clear()
     model.train(1, 16)
     (loss,) = model._unlogged["critic_loss"]
-    model.get_training_state()
+    model._before_saving_state()
     assert model.logger.name_to_value["train/critic_loss"] == pytest.approx(loss.item())
     # A NaN is reported before a state is saved that would hide it
     model.replay_buffer.rewards[:] = np.nan
     model.train(1, 16)
     with pytest.raises(ValueError, match="The critic loss was NaN or infinite at gradient step 32"):
-        model.get_training_state()
+        model._before_saving_state()
 
 
 def test_a_nan_loss_is_checked_every_hundred_steps(stand_in):

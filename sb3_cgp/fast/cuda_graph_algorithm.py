@@ -230,16 +230,9 @@ class CudaGraphAlgorithm(CGP):
             self._loss_watch.check()
         return self
 
-    def get_training_state(self) -> dict[str, Any]:
-        """
-        Return nothing further, but report first: a state saved now has the losses in its log, and no NaN unreported.
-
-        :return: the training state of the other parts of the model
-        :raises ValueError: if a loss was NaN or infinite in a recorded gradient step
-        """
+    def _before_saving_state(self) -> None:
+        # A state saved now has the losses in its log, and no NaN unreported
         self._report()
-        inherited = getattr(super(), "get_training_state", dict)
-        return inherited()
 
     def __getstate__(self) -> dict[str, Any]:
         # Python has a method of this name since 3.11

@@ -205,14 +205,7 @@ class PopulationTraining(CommonGuards, LeanReplayAlgorithm):
         self._record_losses()
         super().dump_logs()
 
-    def get_training_state(self) -> dict[str, Any]:
-        """
-        Return nothing further, but update the log and the failures, which are part of a saved state.
-
-        :return: the training state of the other parts of the model
-        :raises ValueError: if all agents have failed
-        """
+    def _before_saving_state(self) -> None:
+        # Failures and the log are part of a saved state
         self._report_failures()
         self._record_losses()
-        inherited = getattr(super(), "get_training_state", dict)
-        return inherited()

@@ -56,26 +56,11 @@ class ResumableModel(TransientAttributes):
         """Change what is known of the running training."""
         self._training = replace(self._training, **changes)
 
-    def get_training_state(self) -> State:
-        """
-        Return the state that SB3's zip does not hold, as plain data. Subclasses add to what ``super()`` returns.
-
-        It is called before the zip and the pending log are copied, so that a model may update both in this method.
-
-        :return: the state: None, numbers, strings, arrays, tensors, lists, tuples and dictionaries
-        """
-        inherited = getattr(super(), "get_training_state", dict)
-        return inherited()
-
-    def set_training_state(self, state: State) -> None:
-        """
-        Restore the state that :meth:`get_training_state` returned. Subclasses extend it by ``super()``.
-
-        :param state: the state
-        """
-        inherited = getattr(super(), "set_training_state", None)
+    def _before_saving_state(self) -> None:
+        """Bring the attributes and the log up to date, before they are copied into a training state."""
+        inherited = getattr(super(), "_before_saving_state", None)
         if inherited is not None:
-            inherited(state)
+            inherited()
 
     def hold_folder(self, folder: Path) -> None:
         """

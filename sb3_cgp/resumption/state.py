@@ -40,8 +40,7 @@ def gather(model: ResumableModel, callback: BaseCallback) -> State:
     :return: the state; it may share arrays with the training, which will change them
     """
     assert model.env is not None
-    # First, as a model may update its attributes and its log in this call
-    own = model.get_training_state()
+    model._before_saving_state()
     zipped = io.BytesIO()
     model.save(zipped)
     normalizer = model.get_vec_normalize_env()
@@ -57,7 +56,6 @@ def gather(model: ResumableModel, callback: BaseCallback) -> State:
     return {
         "algorithm": type(model).__name__,
         "n_envs": model.n_envs,
-        "own": own,
         "model": zipped.getvalue(),
         "replay_buffer": replay_buffer_state(model._ensure_replay_buffer()),
         "environment": environment,
@@ -89,7 +87,6 @@ def restore(model: ResumableModel, callback: BaseCallback, state: State) -> None
         pending = getattr(model.logger, name)
         pending.clear()
         pending.update(values)
-    model.set_training_state(state["own"])
     # Last, as the calls above may draw random numbers
     _restore_random(model, state["random"])
 
