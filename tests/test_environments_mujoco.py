@@ -13,9 +13,10 @@ from environments import Doubles
 from gymnasium import spaces
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_cgp.resumption.declarations import METHODS
-from sb3_cgp.resumption.environments import restore_environment
+from sb3_cgp.resumption.environments import RestorableEnv, restore_environment
 
 
 def make(environment, seed, **kwargs):
@@ -81,18 +82,35 @@ class Viewing(HopperEnv):
         self.same = self.one
 
 
+def with_copies(env):
+    task = env.unwrapped
+    task.height, task.limits = task.height.copy(), task.limits.copy()
+    return env
+
+
 def test_an_array_that_shares_memory_is_an_obstacle():
     env = make(Viewing, 1)
     height, limits = obstacles(env)
     assert f"Viewing.height shares memory with MuJoCo's data: it has to be a copy, or the class needs {METHODS}." in height
     assert "Viewing.limits shares memory with its init_qpos: it has to be a copy" in limits
-    task = env.envs[0].unwrapped
-    task.height, task.limits = task.height.copy(), task.limits.copy()
+    task = with_copies(env.envs[0]).unwrapped
     assert obstacles(env) == []
     # An environment that has just been made may share what this one does not
     again = make(Viewing, 1)
     restore_environment(again, environment_state(env))
     np.testing.assert_array_equal(again.envs[0].unwrapped.limits, task.limits)
+
+
+def test_an_array_that_shares_memory_in_another_process_is_no_obstacle_to_restoring():
+    options = dict(vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))
+    saved = make(Viewing, 1, wrapper_class=lambda env: RestorableEnv(with_copies(env)), **options)
+    again = make(Viewing, 1, wrapper_class=RestorableEnv, **options)
+    try:
+        assert len(obstacles(again)) == 2
+        restore_environment(again, environment_state(saved))
+    finally:
+        saved.close()
+        again.close()
 
 
 BOX = """

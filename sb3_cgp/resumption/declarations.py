@@ -3,13 +3,25 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import cloudpickle
 
 from sb3_cgp.common.rules import require
 
 METHODS = "get_training_state() and set_training_state()"
+
+
+class Obstacle(NamedTuple):
+    """
+    Why the state of an environment cannot be saved.
+
+    :param text: a sentence, with what would help
+    :param prevents_restoring: whether the environment cannot be restored, either
+    """
+
+    text: str
+    prevents_restoring: bool = True
 
 
 @dataclass(frozen=True)
@@ -103,11 +115,11 @@ def is_declared_name(name: str) -> bool:
     return any(cls.__name__ == name for cls in _declared)
 
 
-def pickle_declarations(problems: list[str]) -> list[bytes]:
+def pickle_declarations(problems: list[Obstacle]) -> list[bytes]:
     """
     Return what :func:`register_restorable` was given in this process, to be sent to workers.
 
-    :param problems: a list to which a sentence is appended for each declaration that cannot be sent
+    :param problems: a list to which an obstacle is appended for each declaration that cannot be sent
     :return: the declarations
     """
     pickled = []
@@ -117,7 +129,8 @@ def pickle_declarations(problems: list[str]) -> list[bytes]:
             pickled.append(cloudpickle.dumps((cls, _full_name(cls), declaration.get, declaration.set)))
         except Exception as error:
             remedy = "give register_restorable functions of a module"
-            problems.append(f"What {cls.__qualname__} was declared with cannot be sent to a process ({error}): {remedy}.")
+            text = f"What {cls.__qualname__} was declared with cannot be sent to a process ({error}): {remedy}."
+            problems.append(Obstacle(text))
     return pickled
 
 

@@ -35,13 +35,14 @@ from stable_baselines3.common.vec_env.stacked_observations import StackedObserva
 from sb3_cgp.common.rules import require
 from sb3_cgp.resumption.declarations import (
     METHODS,
+    Obstacle,
     find_declaration,
     is_declared_name,
     pickle_declarations,
     unpickle_declarations,
 )
 from sb3_cgp.resumption.differences import require_same, warn_of_other_arguments
-from sb3_cgp.resumption.layers import SHARES, is_known, layer_state, set_layer_state
+from sb3_cgp.resumption.layers import is_known, layer_state, set_layer_state
 from sb3_cgp.resumption.replayed import ReplayedEnv
 
 
@@ -54,24 +55,21 @@ class RestorableEnv(gym.Wrapper):
     :param env: the environment
     """
 
-    def get_chain_state(self, declarations: list[bytes]) -> dict[str, Any] | str:
+    def get_chain_state(self, declarations: list[bytes]) -> tuple[dict[str, Any], list[Obstacle]]:
         """
         Copy the state of the wrapped environment, of all its wrappers, and of the process's random generators.
 
         :param declarations: those of the training's process, as ``pickle_declarations`` returned them
-        :return: plain data, or a description of the obstacles if the environment cannot be restored, as an error would end
-            the process
+        :return: plain data, and the obstacles, errors among them, as an error would end the process
         """
-        problems: list[str] = []
+        problems: list[Obstacle] = []
         try:
             unpickle_declarations(declarations)
             state = _chain_state(self, problems)
         except Exception as error:
-            return f"{type(error).__name__}: {error}"
-        if problems:
-            return " ".join(problems)
+            return {}, [Obstacle(f"{type(error).__name__}: {error}")]
         # Wrappers draw from NumPy's global generator, as rl_zoo3's ActionNoiseWrapper does
-        return state | {"random": random.getstate(), "np_random": np.random.get_state()}  # noqa: NPY002
+        return state | {"random": random.getstate(), "np_random": np.random.get_state()}, problems  # noqa: NPY002
 
     def set_chain_state(self, state: dict[str, Any]) -> None:
         """
@@ -94,11 +92,11 @@ def state_and_obstacles(env: VecEnv | gym.Env) -> tuple[dict[str, Any] | None, l
     :raises ValueError: if a ``get_training_state()`` returns anything but plain data
     """
     state, problems = _state(env)
-    return None if problems else state, problems
+    return None if problems else state, [each.text for each in problems]
 
 
-def _state(env: VecEnv | gym.Env) -> tuple[dict[str, Any], list[str]]:
-    problems: list[str] = []
+def _state(env: VecEnv | gym.Env) -> tuple[dict[str, Any], list[Obstacle]]:
+    problems: list[Obstacle] = []
     layers, envs = _parts(env)
     states = [layer_state(layer, problems) for layer in layers]
     in_processes = layers and isinstance(layers[-1], SubprocVecEnv)
@@ -121,7 +119,7 @@ def restore_environment(env: VecEnv | gym.Env, state: dict[str, Any]) -> None:
     """
     current, found = _state(env)
     layers, envs = _parts(env)
-    problems = [each for each in found if SHARES not in each] if envs else found
+    problems = [each.text for each in found if each.prevents_restoring]
     require(not problems, "env", env, f"restorable: {' '.join(problems)}")
     require_same(current, state)
     warn_of_other_arguments(current, state)
@@ -134,15 +132,15 @@ def restore_environment(env: VecEnv | gym.Env, state: dict[str, Any]) -> None:
             layers[-1].env_method("set_chain_state", chain_state, indices=index)
 
 
-def _states_in_processes(env: SubprocVecEnv, problems: list[str]) -> list[Any]:
+def _states_in_processes(env: SubprocVecEnv, problems: list[Obstacle]) -> list[dict[str, Any]]:
     # `env_method` searches the wrappers, too. Every object has a `__dir__`, so that this call reaches the outermost one.
     if not all("get_chain_state" in names for names in env.env_method("__dir__")):
-        problems.append(_remedy_in_processes(env))
+        problems.append(Obstacle(_remedy_in_processes(env)))
         return []
-    declarations = pickle_declarations(problems)
-    chains = env.env_method("get_chain_state", declarations)
-    problems.extend(chain for chain in chains if isinstance(chain, str))
-    return chains
+    replies = env.env_method("get_chain_state", pickle_declarations(problems))
+    for _, obstacles in replies:
+        problems.extend(obstacles)
+    return [state for state, _ in replies]
 
 
 def _remedy_in_processes(env: SubprocVecEnv) -> str:
@@ -207,7 +205,7 @@ def _chain(env: gym.Env) -> Iterator[gym.Env]:
         yield from _chain(env.env)
 
 
-def _chain_state(env: gym.Env, problems: list[str]) -> dict[str, Any]:
+def _chain_state(env: gym.Env, problems: list[Obstacle]) -> dict[str, Any]:
     """Copy the state of an environment and its wrappers."""
     states, is_replayed = [], False
     for layer in _chain(env):

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
 from sb3_cgp.common.sb3_arguments import constructor_argument_names
-from sb3_cgp.resumption.declarations import METHODS, OWN, Declaration, find_declaration
+from sb3_cgp.resumption.declarations import METHODS, OWN, Declaration, Obstacle, find_declaration
 from sb3_cgp.resumption.mujoco_data import (
     get_mujoco_data,
     is_restorable,
@@ -71,22 +71,19 @@ UNSAVED = {
 INFOS = {"buf_infos", "reset_infos"}
 # Of a checker whose last infos are no plain data: its checks of the first two steps, which only warn, are skipped
 CHECKED = {"_previous_data": None, "checked_step": True, "checked_data_reuse": True}
-# Words of an obstacle to saving a state, by which `restore_environment` knows it: restoring is safe, as nothing shared memory
-# when the state was saved
-SHARES = "shares memory with"
 RANDOM_STATE = {"_np_random", "_np_random_seed"}
 # They do not change their MuJoCo models; environments of others may
 CONSTANT_MODELS = "gymnasium.envs.mujoco."
 
 
-def layer_state(layer: Any, problems: list[str], is_replayed: bool = False) -> dict[str, Any]:
+def layer_state(layer: Any, problems: list[Obstacle], is_replayed: bool = False) -> dict[str, Any]:
     """
     Copy the state of one environment or wrapper, without the environment that it wraps.
 
     :param layer: the environment or wrapper
-    :param problems: a list to which a sentence is appended for each obstacle to restoring the layer
+    :param problems: a list to which each obstacle is appended
     :param is_replayed: whether a wrapper around the layer repeats its episode: its random generators alone are then copied
-    :return: plain data, from which the layer can be restored if no sentence was appended
+    :return: plain data, from which the layer can be restored if no obstacle was appended
     :raises ValueError: if ``get_training_state()`` returns anything but plain data
     """
     kind = type(layer)
@@ -117,7 +114,7 @@ def layer_state(layer: Any, problems: list[str], is_replayed: bool = False) -> d
             if not name.startswith(CONSTANT_MODELS):
                 state["mujoco_model"] = model_state(data.model)
         else:
-            problems.append(f"{name} has a MuJoCo model with plugins, flexible bodies or sleep.")
+            problems.append(Obstacle(f"{name} has a MuJoCo model with plugins, flexible bodies or sleep."))
     return state
 
 
@@ -153,14 +150,14 @@ def is_known(module: str) -> bool:
     return f"{module}.".startswith(RESTORABLE_MODULES)
 
 
-def _own_state(layer: Any, name: str, declaration: Declaration, problems: list[str]) -> Any:
+def _own_state(layer: Any, name: str, declaration: Declaration, problems: list[Obstacle]) -> Any:
     assert declaration.get is not None
     own = declaration.get(layer)
     described = f"{name}{declaration.described}"
     if own is None:
-        problems.append(f"{described} returned None.")
+        problems.append(Obstacle(f"{described} returned None."))
     if declaration is OWN and not hasattr(type(layer), "set_training_state"):
-        problems.append(f"{name} has a get_training_state() and no set_training_state(): it needs {METHODS}.")
+        problems.append(Obstacle(f"{name} has a get_training_state() and no set_training_state(): it needs {METHODS}."))
     return declared_state(described, own)
 
 
@@ -170,19 +167,19 @@ def _unsaved(kind: type) -> set[str]:
     return set().union(*(names for origin, names in UNSAVED.items() if any(base.startswith(origin) for base in bases)))
 
 
-def _problems(layer: Any, name: str, handled: Set[str], is_declared: bool) -> list[str]:
-    """Return a sentence for each obstacle to restoring a layer whose state is its attributes."""
+def _problems(layer: Any, name: str, handled: Set[str], is_declared: bool) -> list[Obstacle]:
+    """Return the obstacles of a layer whose state is its attributes."""
     if not (is_declared or is_known(type(layer).__module__)):
         remedy = f"it needs {METHODS}, or sb3_cgp.register_restorable"
-        return [f"{name} is unknown and has no get_training_state(): {remedy}."]
+        return [Obstacle(f"{name} is unknown and has no get_training_state(): {remedy}.")]
     others = {key: vars(layer)[key] for key in vars(layer).keys() - handled - (INFOS if isinstance(layer, VecEnv) else set())}
-    obstacles = {key: value for key, value in sorted(others.items()) if not _is_stateless(value)}
-    sentences = [f"{name}.{key} is {value!r}, which is not plain data." for key, value in obstacles.items()]
-    return sentences if is_known(type(layer).__module__) else sentences + _shared(layer, name)
+    stateful = {key: value for key, value in sorted(others.items()) if not _is_stateless(value)}
+    obstacles = [Obstacle(f"{name}.{key} is {value!r}, which is not plain data.") for key, value in stateful.items()]
+    return obstacles if is_known(type(layer).__module__) else obstacles + _shared(layer, name)
 
 
-def _shared(layer: Any, name: str) -> list[str]:
-    """Return a sentence for each array that changes with another one, or with MuJoCo's data: a restored copy would not."""
+def _shared(layer: Any, name: str) -> list[Obstacle]:
+    """Return an obstacle for each array that changes with another one, or with MuJoCo's data: a restored copy would not."""
     arrays = {key: value for key, value in vars(layer).items() if isinstance(value, np.ndarray) and value.size}
     data = get_mujoco_data(layer)
     others = {key: "MuJoCo's data" for key, array in arrays.items() if data is not None and is_view(array, data)}
@@ -190,7 +187,9 @@ def _shared(layer: Any, name: str) -> list[str]:
         if array is not view and np.shares_memory(array, view):
             others.setdefault(other, f"its {key}")
     remedy = f"it has to be a copy, or the class needs {METHODS}"
-    return [f"{name}.{key} {SHARES} {other}: {remedy}." for key, other in others.items()]
+    sentences = [f"{name}.{key} shares memory with {other}: {remedy}." for key, other in others.items()]
+    # Nothing shared memory when a state was saved
+    return [Obstacle(each, prevents_restoring=False) for each in sentences]
 
 
 def _is_stateless(value: Any) -> bool:
