@@ -194,32 +194,6 @@ def test_what_cannot_be_sent_to_a_process_is_named():
         env.close()
 
 
-@pytest.mark.parametrize("is_declared", [True, False])
-def test_the_remedy_for_a_declared_environment_without_restorable_env_is_this_wrapper(is_declared):
-    gym.register("Foreign-v0", entry_point=f"{__name__}:Foreign")
-    if is_declared:
-        register_restorable(Foreign, get_position, set_position)
-    try:
-        env = make("Foreign-v0", 1, n_envs=1, vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))
-        reason = " ".join(obstacles(env))
-        env.close()
-    finally:
-        gym.registry.pop("Foreign-v0", None)
-    assert ("Make sb3_cgp.resumption.RestorableEnv its outermost wrapper." in reason) == is_declared
-    assert ("RestorableEnv alone would not help" in reason) != is_declared
-
-
-def test_a_declared_environment_that_is_not_registered_has_the_same_remedy():
-    register_restorable(Foreign, get_position, set_position)
-    env = make(Foreign, 1, n_envs=1, vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))
-    try:
-        assert "Make sb3_cgp.resumption.RestorableEnv its outermost wrapper." in " ".join(obstacles(env))
-        declarations._declared.clear()
-        assert "RestorableEnv alone would not help" in " ".join(obstacles(env))
-    finally:
-        env.close()
-
-
 class Adapter(gym.Env):
     """Has another environment, and is no wrapper."""
 

@@ -105,16 +105,6 @@ def find_declaration(kind: type) -> Declaration | None:
     return None
 
 
-def is_declared_name(name: str) -> bool:
-    """
-    Return whether a class of this name was declared in this process.
-
-    :param name: the class's name, without its module
-    :return: whether one was
-    """
-    return any(cls.__name__ == name for cls in _declared)
-
-
 def pickle_declarations(problems: list[Obstacle]) -> list[bytes]:
     """
     Return what :func:`register_restorable` was given in this process, to be sent to workers.

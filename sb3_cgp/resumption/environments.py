@@ -22,8 +22,6 @@ process by the caller.
 """
 
 import random
-import re
-import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -33,17 +31,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
 from sb3_cgp.common.rules import require
-from sb3_cgp.resumption.declarations import (
-    METHODS,
-    Obstacle,
-    find_declaration,
-    is_declared_name,
-    pickle_declarations,
-    unpickle_declarations,
-)
+from sb3_cgp.resumption.declarations import METHODS, Obstacle, pickle_declarations, unpickle_declarations
 from sb3_cgp.resumption.differences import require_same, warn_of_other_arguments
-from sb3_cgp.resumption.layers import is_known, layer_state, set_layer_state
+from sb3_cgp.resumption.layers import layer_state, set_layer_state
 from sb3_cgp.resumption.replayed import ReplayedEnv
+
+WITHOUT_WRAPPER = (
+    "An environment of SubprocVecEnv has no RestorableEnv outermost. Make sb3_cgp.resumption.RestorableEnv its outermost "
+    f"wrapper; an environment outside of the table in docs/trust.md needs {METHODS}, or sb3_cgp.register_restorable, too."
+)
 
 
 class RestorableEnv(gym.Wrapper):
@@ -135,31 +131,12 @@ def restore_environment(env: VecEnv | gym.Env, state: dict[str, Any]) -> None:
 def _states_in_processes(env: SubprocVecEnv, problems: list[Obstacle]) -> list[dict[str, Any]]:
     # `env_method` searches the wrappers, too. Every object has a `__dir__`, so that this call reaches the outermost one.
     if not all("get_chain_state" in names for names in env.env_method("__dir__")):
-        problems.append(Obstacle(_remedy_in_processes(env)))
+        problems.append(Obstacle(WITHOUT_WRAPPER))
         return []
     replies = env.env_method("get_chain_state", pickle_declarations(problems))
     for _, obstacles in replies:
         problems.extend(obstacles)
     return [state for state, _ in replies]
-
-
-def _remedy_in_processes(env: SubprocVecEnv) -> str:
-    """Describe the remedy for an environment of a SubprocVecEnv whose outermost wrapper is not RestorableEnv."""
-    missing = "An environment of SubprocVecEnv has no RestorableEnv outermost."
-    described = env.env_method("__str__")[0]
-    # Gymnasium's description of an environment is <class<id>>
-    found = re.search(r"<([^<>]+)<([^<>]+)>", described)
-    spec = None if found is None else gym.registry.get(found[2])
-    entry_point = None if spec is None else spec.entry_point
-    module, _, name = entry_point.partition(":") if isinstance(entry_point, str) else ("", "", "")
-    kind = getattr(sys.modules.get(module), name, None) if module else entry_point
-    # Without an id, an environment is described by the name of its class alone
-    unregistered = re.search(r"<(\w+) instance>", described)
-    is_declared = isinstance(kind, type) and find_declaration(kind) is not None
-    is_declared = is_declared or (unregistered is not None and is_declared_name(unregistered[1]))
-    if is_known(module) or is_declared or all(env.env_method("has_wrapper_attr", "get_training_state")):
-        return f"{missing} Make sb3_cgp.resumption.RestorableEnv its outermost wrapper."
-    return f"{missing} RestorableEnv alone would not help: {described} has no {METHODS}, which it needs as well."
 
 
 def _parts(env: VecEnv | gym.Env) -> tuple[list[Any], list[gym.Env]]:

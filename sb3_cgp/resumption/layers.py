@@ -141,15 +141,6 @@ def set_layer_state(layer: Any, state: dict[str, Any]) -> None:
             set_model_state(data.model, state["mujoco_model"])
 
 
-def is_known(module: str) -> bool:
-    """
-    Return whether the environments and wrappers of a module are known to be restorable.
-
-    :param module: the module's name
-    """
-    return f"{module}.".startswith(RESTORABLE_MODULES)
-
-
 def _own_state(layer: Any, name: str, declaration: Declaration, problems: list[Obstacle]) -> Any:
     assert declaration.get is not None
     own = declaration.get(layer)
@@ -161,6 +152,11 @@ def _own_state(layer: Any, name: str, declaration: Declaration, problems: list[O
     return declared_state(described, own)
 
 
+def _is_known(kind: type) -> bool:
+    """Return whether the environments and wrappers of a class's module are known to be restorable."""
+    return f"{kind.__module__}.".startswith(RESTORABLE_MODULES)
+
+
 def _unsaved(kind: type) -> set[str]:
     """Return the names of the attributes of a class that have no state."""
     bases = [f"{base.__module__}.{base.__qualname__}" for base in kind.__mro__]
@@ -169,13 +165,13 @@ def _unsaved(kind: type) -> set[str]:
 
 def _problems(layer: Any, name: str, handled: Set[str], is_declared: bool) -> list[Obstacle]:
     """Return the obstacles of a layer whose state is its attributes."""
-    if not (is_declared or is_known(type(layer).__module__)):
+    if not (is_declared or _is_known(type(layer))):
         remedy = f"it needs {METHODS}, or sb3_cgp.register_restorable"
         return [Obstacle(f"{name} is unknown and has no get_training_state(): {remedy}.")]
     others = {key: vars(layer)[key] for key in vars(layer).keys() - handled - (INFOS if isinstance(layer, VecEnv) else set())}
     stateful = {key: value for key, value in sorted(others.items()) if not _is_stateless(value)}
     obstacles = [Obstacle(f"{name}.{key} is {value!r}, which is not plain data.") for key, value in stateful.items()]
-    return obstacles if is_known(type(layer).__module__) else obstacles + _shared(layer, name)
+    return obstacles if _is_known(type(layer)) else obstacles + _shared(layer, name)
 
 
 def _shared(layer: Any, name: str) -> list[Obstacle]:
