@@ -1,4 +1,4 @@
-"""Encoding training states as JSON and blocks of bytes, without pickle."""
+"""Encoding training states as JSON and blocks of bytes. It pickles nothing; the model, SB3's zip, is bytes to it."""
 
 from collections.abc import Callable, Iterator
 from typing import Any

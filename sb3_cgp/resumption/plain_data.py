@@ -1,4 +1,4 @@
-"""Convert the attributes of objects to plain data, which a training state can hold without pickle, and back."""
+"""Convert the attributes of objects to plain data, which a training state can hold, and back."""
 
 from collections import Counter, OrderedDict, defaultdict, deque
 from collections.abc import Collection, Mapping

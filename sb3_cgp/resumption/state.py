@@ -2,7 +2,8 @@
 The complete state of a training: SB3's zip, and all state that the zip does not hold. A restored training is exact: it
 computes the same numbers as a training that was not interrupted.
 
-A state is a tree of plain data, arrays and tensors (:mod:`sb3_cgp.resumption.encoding`).
+A state is a tree of plain data, arrays and tensors (:mod:`sb3_cgp.resumption.encoding`), and of the bytes of the zip, which
+``resume`` unpickles.
 """
 
 import io

@@ -3,7 +3,10 @@ A folder of training states. A state is written completely or not at all, and is
 
 ``state-<step>.json`` holds a state's plain data. Arrays lie in a folder of blocks, which are files named by the SHA-256 of
 their content, so that states share equal blocks: of a replay buffer, only the changed blocks are written. There are two such
-folders, which states use in turn: damage to one file cannot destroy two successive states. Nothing is pickled.
+folders, which states use in turn: damage to one file cannot destroy two successive states.
+
+Checksums show damage, not who wrote a state. The store unpickles nothing itself, but the model within a state is SB3's zip,
+which ``resume`` unpickles: a stranger's state can run any code.
 """
 
 import hashlib
