@@ -215,7 +215,7 @@ class ResumableAlgorithm(ResumableModel):
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         callback = super()._init_callback(callback, progress_bar)
-        checkpoints = [each for each in iter_callbacks(callback) if isinstance(each, TrainingCheckpointCallback)]
+        checkpoints = checkpoints_among(callback)
         for each in checkpoints:
             allowed = "None: give a TrainingCheckpointCallback to `learn` itself. Other callbacks do not report rollouts to it"
             require(each.parent is None, "parent", each.parent, allowed)

@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cgp.common.sb3_arguments import constructor_argument_names
-from sb3_cgp.resumption.declarations import METHODS
+from sb3_cgp.resumption.declarations import METHODS, full_name
 from sb3_cgp.resumption.environments import is_part_of, restore_environment, state_and_obstacles
 from sb3_cgp.resumption.fingerprints import LEFT_OUT, fingerprint
 from sb3_cgp.resumption.plain_data import declared_state, from_plain, plain_attributes, set_plain_attributes
@@ -94,8 +94,9 @@ def restore_callbacks(callback: BaseCallback, states: list[State]) -> None:
     present: dict[tuple[str, int], BaseCallback] = {}
     seen: Counter[str] = Counter()
     for each in iter_callbacks(callback):
-        present[_class_name(each), seen[_class_name(each)]] = each
-        seen[_class_name(each)] += 1
+        name = full_name(type(each))
+        present[name, seen[name]] = each
+        seen[name] += 1
     saved: Counter[str] = Counter()
     for state in states:
         name = state["class"]
@@ -126,7 +127,7 @@ def _restore_callback(callback: BaseCallback, state: State) -> None:
 
 
 def _callback_state(callback: BaseCallback, training_env: VecEnv, start: Start, problems: list[str]) -> State:
-    state: State = {"class": _class_name(callback), "environments": {}}
+    state: State = {"class": full_name(type(callback)), "environments": {}}
     for name, env in _environments(callback, training_env).items():
         state["environments"][name], obstacles = state_and_obstacles(env)
         if obstacles:
@@ -167,7 +168,3 @@ def _environments(callback: BaseCallback, training_env: VecEnv) -> dict[str, Vec
     """Return the environments of a callback by attribute, without the training's own."""
     found = {name: value for name, value in vars(callback).items() if isinstance(value, VecEnv | gym.Env)}
     return {name: value for name, value in found.items() if not is_part_of(value, training_env)}
-
-
-def _class_name(thing: object) -> str:
-    return f"{type(thing).__module__}.{type(thing).__qualname__}"

@@ -84,6 +84,16 @@ def register_restorable(
     _declared[cls] = Declaration(get, set, DESCRIBED)
 
 
+def full_name(cls: type) -> str:
+    """
+    Return the name of a class with its module.
+
+    :param cls: the class
+    :return: the name
+    """
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
 def find_declaration(kind: type) -> Declaration | None:
     """
     Return how the objects of a class are saved, by the first of its base classes that says so.
@@ -92,7 +102,7 @@ def find_declaration(kind: type) -> Declaration | None:
     :return: the declaration, or None
     """
     for base in kind.__mro__:
-        name = _full_name(base)
+        name = full_name(base)
         if name in _received:
             return _received[name]
         if base in _declared:
@@ -116,7 +126,7 @@ def pickle_declarations(problems: list[Obstacle]) -> list[bytes]:
     for cls, declaration in _declared.items():
         try:
             # By cloudpickle, as SubprocVecEnv sends environments: it takes functions of scripts, too
-            pickled.append(cloudpickle.dumps((cls, _full_name(cls), declaration.get, declaration.set)))
+            pickled.append(cloudpickle.dumps((cls, full_name(cls), declaration.get, declaration.set)))
         except Exception as error:
             remedy = "give register_restorable functions of a module"
             text = f"What {cls.__qualname__} was declared with cannot be sent to a process ({error}): {remedy}."
@@ -132,10 +142,6 @@ def unpickle_declarations(pickled: list[bytes]) -> None:
     """
     for cls, name, get, set_function in map(cloudpickle.loads, pickled):
         _declared[cls] = _received[name] = Declaration(get, set_function, DESCRIBED)
-
-
-def _full_name(cls: type) -> str:
-    return f"{cls.__module__}.{cls.__qualname__}"
 
 
 def _ready(module: str) -> Declaration:

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_cgp.resumption.declarations import full_name
 from sb3_cgp.resumption.mujoco_data import is_restorable, model_state, mujoco_state, set_model_state, set_mujoco_state
 from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
 
@@ -23,8 +24,7 @@ def get_state(env: Any) -> dict[str, Any] | None:
     """
     inner = env._env
     # By its full name, as importing dm_control takes long
-    name = f"{type(inner).__module__}.{type(inner).__qualname__}"
-    if name != "dm_control.rl.control.Environment" or not is_restorable(inner.physics.data.ptr):
+    if full_name(type(inner)) != "dm_control.rl.control.Environment" or not is_restorable(inner.physics.data.ptr):
         return None
     task = plain_attributes(inner.task, UNSAVED)
     if vars(inner.task).keys() - task.keys() - UNSAVED:

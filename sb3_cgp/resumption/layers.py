@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
 from sb3_cgp.common.sb3_arguments import constructor_argument_names
-from sb3_cgp.resumption.declarations import METHODS, OWN, Declaration, Obstacle, find_declaration
+from sb3_cgp.resumption.declarations import METHODS, OWN, Declaration, Obstacle, find_declaration, full_name
 from sb3_cgp.resumption.mujoco_data import (
     get_mujoco_data,
     is_restorable,
@@ -87,7 +87,7 @@ def layer_state(layer: Any, problems: list[Obstacle], is_replayed: bool = False)
     :raises ValueError: if ``get_training_state()`` returns anything but plain data
     """
     kind = type(layer)
-    name = f"{kind.__module__}.{kind.__qualname__}"
+    name = full_name(kind)
     state: dict[str, Any] = {"class": name}
     # Looked up in the class, as wrappers of vectorised environments forward the attributes of the wrapped one
     declaration = find_declaration(kind)
@@ -159,7 +159,7 @@ def _is_known(kind: type) -> bool:
 
 def _unsaved(kind: type) -> set[str]:
     """Return the names of the attributes of a class that have no state."""
-    bases = [f"{base.__module__}.{base.__qualname__}" for base in kind.__mro__]
+    bases = [full_name(base) for base in kind.__mro__]
     return set().union(*(names for origin, names in UNSAVED.items() if any(base.startswith(origin) for base in bases)))
 
 

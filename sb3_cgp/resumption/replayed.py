@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_cgp.common.rules import require
+from sb3_cgp.resumption.declarations import full_name
 from sb3_cgp.resumption.plain_data import NotPlainError, equal, set_plain_attributes, to_plain
 
 
@@ -141,7 +142,7 @@ def _make_new_world(env: gym.Env) -> None:
     """Give Gymnasium's BipedalWalker a new world, as its LunarLander has in each episode: an old one keeps its contacts."""
     name = "gymnasium.envs.box2d.bipedal_walker.BipedalWalker"
     # By its name, as importing Box2D takes long
-    if any(f"{base.__module__}.{base.__qualname__}" == name for base in type(env).__mro__):
+    if any(full_name(base) == name for base in type(env).__mro__):
         walker: Any = env
         # Removes what is in the old world, which the environment's `reset` could not remove from the new one
         walker._destroy()
