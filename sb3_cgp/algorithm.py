@@ -274,8 +274,10 @@ class CGP(
         :raises ValueError: if there is no policy loss or no data, if observations are not normalised and the critics have
             learnt from normalised ones, or if a loss is NaN or infinite
         """
-        allowed = "None: call `learn`, which resumes the interrupted training, before `train_policy`"
-        require(self.resumption is None, "resumption", "a loaded state", allowed)
+        if self.resumption is not None:
+            raise ValueError(
+                "A training state has been loaded by `resume`: call `learn`, which continues it, before `train_policy`."
+            )
         check_callback("callback", callback)
         with self.as_training(), explaining_errors(self):
             self._check_normalisation()

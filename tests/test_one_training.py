@@ -133,6 +133,11 @@ def test_models_can_be_copied_whenever_those_of_td3_can(copied, tmp_path):
     assert copy.deepcopy(td3).num_timesteps == 10
 
 
+def test_a_loaded_training_goes_on_before_the_policy_alone_is_trained(folder):
+    with pytest.raises(ValueError, match="A training state has been loaded by `resume`: call `learn`"):
+        CGP.resume(folder, env()).train_policy(10)
+
+
 def make_buffer(cls, size=20, dtype=np.float32):
     space = make_vec_env("Pendulum-v1").observation_space
     space.dtype = np.dtype(dtype)

@@ -10,8 +10,8 @@ from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
 
 # Those of `dm_control.rl.control.Environment` that change
 EPISODE = ("_step_count", "_reset_next_step")
-# The random generator, which is NumPy's old one, and what does not change: sets of names
-UNSAVED = {"_random"}
+# The task's random generator, which is NumPy's old one
+SAVED_APART = {"_random"}
 
 
 def get_state(env: Any) -> dict[str, Any] | None:
@@ -26,8 +26,8 @@ def get_state(env: Any) -> dict[str, Any] | None:
     # By its full name, as importing dm_control takes long
     if full_name(type(inner)) != "dm_control.rl.control.Environment" or not is_restorable(inner.physics.data.ptr):
         return None
-    task = plain_attributes(inner.task, UNSAVED)
-    if vars(inner.task).keys() - task.keys() - UNSAVED:
+    task = plain_attributes(inner.task, SAVED_APART)
+    if vars(inner.task).keys() - task.keys() - SAVED_APART:
         return None
     return {
         "episode": {name: getattr(inner, name) for name in EPISODE},

@@ -47,7 +47,7 @@ STATELESS_TYPES = (
 STATELESS_MODULES = ("gymnasium.envs.mujoco.mujoco_rendering.", "gymnasium_robotics.utils.mujoco_utils.", "mujoco.", "pygame.")
 # Attributes without state, by the names of the classes, or of their modules, whose objects and those of subclasses have them
 VEC_ENV = "stable_baselines3.common.vec_env."
-UNSAVED = {
+STATELESS_ATTRIBUTES = {
     # The wrapped environments and stacks, each of which has a state of its own
     "gymnasium.core.Wrapper": {"env"},
     f"{VEC_ENV}base_vec_env.": {"venv", "class_attributes", "metadata", "render_mode"},
@@ -160,7 +160,9 @@ def _is_known(kind: type) -> bool:
 def _unsaved(kind: type) -> set[str]:
     """Return the names of the attributes of a class that have no state."""
     bases = [full_name(base) for base in kind.__mro__]
-    return set().union(*(names for origin, names in UNSAVED.items() if any(base.startswith(origin) for base in bases)))
+    return set().union(
+        *(names for origin, names in STATELESS_ATTRIBUTES.items() if any(base.startswith(origin) for base in bases))
+    )
 
 
 def _problems(layer: Any, name: str, handled: Set[str], is_declared: bool) -> list[Obstacle]:

@@ -25,7 +25,7 @@ from sb3_cgp.resumption.plain_data import plain_attributes, set_plain_attributes
 
 State = dict[str, Any]
 # The types of a buffer's attributes that hold no state; its environment is saved as the model's
-STATELESS_TYPES = (Enum, FunctionType, np.dtype, spaces.Space, th.device, type, VecEnv)
+CONSTANT_TYPES = (Enum, FunctionType, np.dtype, spaces.Space, th.device, type, VecEnv)
 # SB3's fields, none of which refers to a row's position
 SB3_FIELDS = {"observations", "next_observations", "actions", "rewards", "dones", "timeouts"}
 
@@ -85,7 +85,7 @@ def check_savable(buffer: ReplayBuffer) -> None:
     attributes = plain_attributes(buffer, without={"infos", *_field_names(buffer)})
     saved = {*_field_names(buffer), *attributes, "infos"}
     for name, value in vars(buffer).items():
-        is_saved = name in saved or isinstance(value, STATELESS_TYPES) or _is_storage(buffer, value)
+        is_saved = name in saved or isinstance(value, CONSTANT_TYPES) or _is_storage(buffer, value)
         require(is_saved, f"replay_buffer.{name}", value, "plain data or an array where the training is saved")
 
 

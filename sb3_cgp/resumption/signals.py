@@ -41,9 +41,9 @@ class StopSignals:
         for number in (signal.SIGTERM, signal.SIGINT):
             handler = signal.getsignal(number)
             is_watched = isinstance(getattr(handler, "__self__", None), StopSignals)
-            is_python_s = number == signal.SIGTERM or handler is signal.default_int_handler
+            may_be_replaced = number == signal.SIGTERM or handler is signal.default_int_handler
             # A handler that Python has not set (None) could not be restored
-            if handler not in (None, signal.SIG_IGN) and not is_watched and is_python_s:
+            if handler not in (None, signal.SIG_IGN) and not is_watched and may_be_replaced:
                 self._previous[number] = signal.signal(number, self._note)
 
     def restore(self) -> None:
