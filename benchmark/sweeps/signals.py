@@ -73,8 +73,7 @@ def _end(number: int) -> None:
 
 
 def _is_ending() -> bool:
-    training = StopSignals.current()
-    return len(_noted) > 0 or (training is not None and training.noted is not None)
+    return len(_noted) > 0 or StopSignals.is_asked()
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:

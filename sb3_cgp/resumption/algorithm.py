@@ -15,20 +15,19 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Progr
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
 from sb3_cgp.common.files import whole_file
 from sb3_cgp.common.load_arguments import check_load_arguments
 from sb3_cgp.common.rules import require
 from sb3_cgp.resumption.callback_states import iter_callbacks
-from sb3_cgp.resumption.callbacks import NO_STATE, TrainingCheckpointCallback, checkpoints_among
+from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback, checkpoints_among
 from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.logs import continued_logger
 from sb3_cgp.resumption.model import ResumableModel
 from sb3_cgp.resumption.progress_bars import show_whole_training
 from sb3_cgp.resumption.replay_buffers import fill_replay_buffer
-from sb3_cgp.resumption.signals import StopSignals, end_training
 from sb3_cgp.resumption.state import begin_new_episode, check_fits
 from sb3_cgp.resumption.store import StateStore
 
@@ -246,22 +245,6 @@ class ResumableAlgorithm(ResumableModel):
         with self.as_training():
             return super().learn(*args, **kwargs)
 
-    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """
-        Collect experiences, see SB3's method, unless a signal ends a training in one of whose callbacks this one runs.
-
-        :param args: the arguments of SB3's method
-        :param kwargs: the arguments of SB3's method
-        :return: the numbers of steps and episodes, and whether to go on
-        :raises KeyboardInterrupt: after Ctrl-C
-        :raises SystemExit: after SIGTERM
-        """
-        asked = None if self._training.outer_signals is None else self._training.outer_signals.noted
-        # With states, this rollout's start saves one and ends the training
-        if asked is not None and all(each.path is None for each in self._checkpoints()):
-            end_training(asked, f"The training was interrupted: {NO_STATE}")
-        return super().collect_rollouts(*args, **kwargs)
-
     @contextmanager
     def as_training(self) -> Iterator[None]:
         """
@@ -271,8 +254,6 @@ class ResumableAlgorithm(ResumableModel):
         also releases the folders of states, and removes the callbacks from the model.
         """
         outer = self._training
-        if outer.n_nested == 0:
-            self._note_training(outer_signals=StopSignals.current())
         self._note_training(n_nested=outer.n_nested + 1)
         try:
             yield
@@ -282,11 +263,6 @@ class ResumableAlgorithm(ResumableModel):
                 self._stop_if_asked()
             for each in self._checkpoints():
                 each.signals.pass_on()
-            raise
-        except KeyboardInterrupt as error:
-            # Of a training within a callback: name the state of this one. Python's own, of a second Ctrl-C, has no arguments.
-            if error.args and any(each.signals.noted is not None for each in self._checkpoints()):
-                self._stop_if_asked()
             raise
         else:
             # The signal came during the last step or the saving of its state. The code after `learn` could take too long.
@@ -307,7 +283,7 @@ class ResumableAlgorithm(ResumableModel):
     @property
     def _is_interrupted(self) -> bool:
         """Whether Ctrl-C has been pressed."""
-        return any(each.noted_signal == signal.SIGINT for each in self._checkpoints())
+        return any(each.signals.noted == signal.SIGINT for each in self._checkpoints())
 
     def _stop_if_asked(self) -> None:
         for each in self._checkpoints():

@@ -14,8 +14,6 @@ from sb3_cgp.resumption.signals import StopSignals, end_training
 from sb3_cgp.resumption.state import gather, restore
 from sb3_cgp.resumption.store import StateStore
 
-NO_STATE = "it has no state"
-
 
 class TrainingCheckpointCallback(BaseCallback):
     """
@@ -29,8 +27,8 @@ class TrainingCheckpointCallback(BaseCallback):
     the process exits with status 143, or ``learn`` raises ``KeyboardInterrupt``. A handler of SIGTERM that was set before is
     called in between. A training without rollouts ends at its next step without saving: ``learn`` has saved the state at its
     start, and a user's call of ``train_policy`` is to be repeated. A second signal has the effect that it has without this
-    callback. Of several such callbacks, the first one handles the signals. A training within a callback of another training
-    ends first, and saves its state; the exception then ends the other one within its step, whose last state remains.
+    callback. Of several such callbacks, the first one handles the signals. A training within a callback of a training that
+    saves states runs to its end; then the outer one saves its state and ends.
 
     One training at a time can use the folder. It is locked from ``resume``, or the start of ``learn``, until ``learn`` ends.
 
@@ -114,7 +112,7 @@ class TrainingCheckpointCallback(BaseCallback):
         self._restore_if_resumed()
         if self.path is None:
             return
-        asked = next((each for each in self._saving if each.noted_signal is not None), None)
+        asked = next((each for each in self._saving if each.signals.noted is not None), None)
         if asked is not None:
             if self.num_timesteps > self._saved_at or not self.has_state:
                 self._save()
@@ -196,12 +194,6 @@ class TrainingCheckpointCallback(BaseCallback):
         if self.verbose >= 2:
             print(f"Saving the training state of step {self.num_timesteps} to {self.path}")
 
-    @property
-    def noted_signal(self) -> int | None:
-        """The signal that asks this training to end, or the one in one of whose callbacks it runs; None without one."""
-        outer = self.model._training.outer_signals
-        return outer.noted if self.signals.noted is None and outer is not None else self.signals.noted
-
     def stop_if_asked(self) -> None:
         """
         End the training if a signal has asked for it.
@@ -209,9 +201,8 @@ class TrainingCheckpointCallback(BaseCallback):
         :raises KeyboardInterrupt: after Ctrl-C
         :raises SystemExit: after SIGTERM
         """
-        number = self.noted_signal
+        number = self.signals.noted
         if number is not None:
-            # An outer training's signal stays noted, for the outer one to end as well
             self.signals.pass_on()
             self.signals.noted = None
             end_training(number, f"The training was interrupted: {self._kept_state}")
@@ -222,7 +213,9 @@ class TrainingCheckpointCallback(BaseCallback):
         if self._has_stepped and not self._is_in_rollouts and self.model._training.n_nested == 1:
             # Not by `learn`, which saves the state at the start, and repeats this training
             return "`train_policy` saves no state before its end; call it again to go on from the actor as it is"
-        return f"its state of step {self._saved_at} is in {self.path}; `resume` continues it" if self.has_state else NO_STATE
+        if not self.has_state:
+            return "it has no state"
+        return f"its state of step {self._saved_at} is in {self.path}; `resume` continues it"
 
     def release(self) -> None:
         """Restore the signals' handlers. Save no state until the next training starts, as this one may have failed."""

@@ -12,7 +12,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_cgp.common.transient import TransientAttributes
 from sb3_cgp.resumption.callback_states import Start
 from sb3_cgp.resumption.locks import FolderLock
-from sb3_cgp.resumption.signals import StopSignals
 
 State = dict[str, Any]
 
@@ -27,7 +26,6 @@ class RunningTraining:
     :param added_checkpoint: the callback that saves states in a resumed training without one among its callbacks
     :param folder_locks: the locks that the training holds
     :param n_nested: a policy's offline training may run within `learn`
-    :param outer_signals: the signals of the training in one of whose callbacks this one runs
     :param warned_of: the warnings about the training state that were given
     """
 
@@ -36,7 +34,6 @@ class RunningTraining:
     added_checkpoint: BaseCallback | None = None
     folder_locks: Mapping[Path, FolderLock] = field(default_factory=dict)
     n_nested: int = 0
-    outer_signals: StopSignals | None = None
     warned_of: frozenset[str] = frozenset()
 
 

@@ -13,11 +13,12 @@ class StopSignals:
     """
     Note a signal that asks the process to end, so that a training can save its state before.
 
-    SIGTERM's own handler is called when the training ends. A second signal has the effect that it has without this object.
+    SIGTERM's own handler is called when the training ends. A second signal has the effect that it has without this object. In
+    a training within a callback of another one, only the object of the outer one has an effect.
     """
 
-    # The object of the training in progress. A training within one of its callbacks ends by what this object notes.
-    _current: ClassVar[Optional["StopSignals"]] = None
+    # The one that has noted the last signal
+    _last: ClassVar[Optional["StopSignals"]] = None
 
     def __init__(self) -> None:
         self.noted: int | None = None
@@ -33,11 +34,9 @@ class StopSignals:
         It has no effect in another thread than the main one, where Python sets no handlers, on a signal that is ignored or
         that another such object handles, on SIGINT if it has another handler than Python's own, and after a noted signal.
         """
-        if threading.current_thread() is not threading.main_thread() or self.noted is not None:
+        if threading.current_thread() is not threading.main_thread() or StopSignals.is_asked():
             return
         self._process = os.getpid()
-        if StopSignals.current() is None:
-            StopSignals._current = self
         for number in (signal.SIGTERM, signal.SIGINT):
             handler = signal.getsignal(number)
             is_watched = isinstance(getattr(handler, "__self__", None), StopSignals)
@@ -57,8 +56,6 @@ class StopSignals:
         """Restore the handlers, and forget the noted signal, at the end of the training."""
         self.restore()
         self.noted = self._noted_handler = None
-        if StopSignals._current is self:
-            StopSignals._current = None
 
     def pass_on(self) -> None:
         """Call the handler that a noted SIGTERM had, if Python has set one, at the end of the training."""
@@ -67,10 +64,9 @@ class StopSignals:
             self._noted_handler(signal.SIGTERM, None)
 
     @classmethod
-    def current(cls) -> Optional["StopSignals"]:
-        """Return the object of the training in progress in the main thread of this process; None in another thread."""
-        current, is_main = cls._current, threading.current_thread() is threading.main_thread()
-        return current if current is not None and is_main and current._process == os.getpid() else None
+    def is_asked(cls) -> bool:
+        """Return whether a training of this process, which has not ended yet, has noted a signal."""
+        return cls._last is not None and cls._last.noted is not None and cls._last._process == os.getpid()
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         handler = self._previous.get(number)
@@ -79,7 +75,7 @@ class StopSignals:
             # This process was forked during the training, by a simulator for example: the signal has its usual effect
             os.kill(os.getpid(), number)
             return
-        self.noted, self._noted_handler = number, handler
+        self.noted, self._noted_handler, StopSignals._last = number, handler, self
         if number == signal.SIGINT:
             # `print` in a handler may interrupt another `print`
             os.write(2, MESSAGE)
