@@ -186,7 +186,7 @@ def test_a_run_that_was_killed_before_it_saved_its_last_model_goes_on(monkeypatc
     start(monkeypatch, command(tmp_path))
     run = run_of(tmp_path)
     final = CGP.load(run / "Pendulum-v1.zip")
-    final.num_timesteps = 100
+    final.num_timesteps, final._training_has_ended = 100, False
     final.save(run / "Pendulum-v1.zip")
     assert max(StateStore(run / "state").steps()) == 330
     resume(run)
@@ -296,6 +296,20 @@ def test_a_run_that_was_interrupted_says_how_it_is_continued_and_is_free(error, 
     assert f"Resuming the training in {second / 'state'} at step 64" in said
     assert f"{second} has ended at step 100: its final model is {second / 'Pendulum-v1.zip'}" in said
     assert "interrupted" not in said
+
+
+@pytest.mark.parametrize("checkpoint", [CHECKPOINT, ""], ids=["with states", "without"])
+def test_a_run_that_a_callback_ends_has_ended(checkpoint, monkeypatch, tmp_path, capsys):
+    """It is not interrupted: its final model stays as it is."""
+    stop = "{'stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes': dict(max_episodes=4)}"
+    start(monkeypatch, command(tmp_path, callbacks=", ".join(filter(None, [checkpoint, stop]))))
+    model = run_of(tmp_path) / "Pendulum-v1.zip"
+    before = model.read_bytes()
+    assert CGP.load(model).num_timesteps < 330
+    assert "interrupted" not in capsys.readouterr().out
+    resume(run_of(tmp_path))
+    assert "has ended: there is nothing to resume" in capsys.readouterr().out
+    assert model.read_bytes() == before
 
 
 def test_a_run_without_states_is_as_it_was_before(monkeypatch, tmp_path):

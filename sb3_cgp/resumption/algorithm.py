@@ -255,6 +255,7 @@ class ResumableAlgorithm(ResumableModel):
         """
         outer = self._training
         self._note_training(n_nested=outer.n_nested + 1)
+        self._training_has_ended = False
         try:
             yield
         except (Exception, SystemExit) as error:
@@ -267,6 +268,7 @@ class ResumableAlgorithm(ResumableModel):
         else:
             # The signal came during the last step or the saving of its state. The code after `learn` could take too long.
             self._stop_if_asked()
+            self._training_has_ended = outer.n_nested == 0
         finally:
             for each in self._checkpoints():
                 each.release()

@@ -48,6 +48,8 @@ class ResumableModel(TransientAttributes):
     saved_to: Mapping[Path, frozenset[str]] = MappingProxyType({})
     # `num_timesteps` at the start of the last call of `learn`
     _training_started_at: int = 0
+    # Whether the last training ended by itself or by a callback, not by a signal or an error
+    _training_has_ended: bool = False
 
     def _note_training(self, **changes: Any) -> None:
         """Change what is known of the running training."""

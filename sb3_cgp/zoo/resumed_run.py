@@ -180,9 +180,9 @@ def is_finished(folder: Path, args: argparse.Namespace, hyperparams: dict[str, A
     :param folder: the run's folder
     :param args: the run's command line
     :param hyperparams: the run's hyperparameters
-    :return: whether the final model exists and its training was complete. rl_zoo3 also saves a model after Ctrl-C, which may
-        come before the last environment step or during offline policy training.
-    :raises FileNotFoundError: if the training is not complete, and has no state
+    :return: whether the final model exists and its training had ended, by itself or by a callback. rl_zoo3 also saves a model
+        after Ctrl-C.
+    :raises FileNotFoundError: if the training has not ended, and has no state
     """
     states = states_of(folder, hyperparams)
     steps = StateStore(states).steps()
@@ -197,14 +197,14 @@ def is_finished(folder: Path, args: argparse.Namespace, hyperparams: dict[str, A
         return False
     data, _, _ = load_from_zip_file(model, device="cpu")
     assert data is not None
-    # The model is that of an earlier interruption where the process was killed before it saved the last one
-    n_done = min(data["num_timesteps"], max(steps, default=data["num_timesteps"]))
-    is_complete = bool(n_done >= n_timesteps and not data["_policy_is_due"])
-    if not steps and not is_complete:
+    # Not in models of earlier commits, of which no harm is done by training them again from their last state
+    has_ended = bool(data.get("_training_has_ended", False))
+    if not steps and not has_ended:
+        n_done = data["num_timesteps"]
         raise FileNotFoundError(
             f"The run was interrupted at step {n_done:,} of {n_timesteps:,}, before it saved a state in {states}. {anew}"
         )
-    return is_complete
+    return has_ended
 
 
 def set_up(folder: Path, args: argparse.Namespace, hyperparams: dict[str, Any]) -> tuple[ResumedExperiment, BaseAlgorithm]:

@@ -53,7 +53,7 @@ def how_to_continue(folder: str | Path, states: str, model: Any, n_timesteps: in
     :param n_timesteps: environment steps of the whole run
     :return: the lines; None if the run was not interrupted
     """
-    if model.num_timesteps >= n_timesteps and not model._policy_is_due:
+    if model._training_has_ended:
         return None
     stopped = f"The run was interrupted at step {model.num_timesteps:,} of {n_timesteps:,}."
     steps = StateStore(Path(states)).steps()
