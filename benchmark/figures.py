@@ -91,14 +91,14 @@ def find(study: str, storage: str | None, out: Path) -> Path:
         raise FileNotFoundError(f"{study} is no folder; to take a study of that name from a storage, name it with --storage")
     # Optuna takes a second to import, and only studies of a storage need it
     from benchmark.sweeps.exports import export_study
-    from benchmark.sweeps.storages import STORAGE_ERRORS, reason_of, without_password
+    from benchmark.sweeps.storages import StorageError, without_password
 
     try:
         return export_study(study, storage, out)
     except KeyError as error:
         raise FileNotFoundError(f"The storage {without_password(storage)} holds no sweep {study}") from error
-    except STORAGE_ERRORS as error:
-        raise ValueError(f"the storage does not answer: {reason_of(error)}") from error
+    except StorageError as error:
+        raise ValueError(f"the storage does not answer: {error}") from error
 
 
 if __name__ == "__main__":

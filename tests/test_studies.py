@@ -17,7 +17,7 @@ from studies import GRACE, Crew, assert_each_run_once, make_sweep, mortal, prete
 import benchmark.worker
 from benchmark.common.provenance import machine, processor
 from benchmark.sweeps import worker_loop as worker
-from benchmark.sweeps.storages import open_storage
+from benchmark.sweeps.storages import StorageError, open_storage
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import WORKER
 from benchmark.sweeps.worker_loop import execute_runs
@@ -105,7 +105,20 @@ def attempt(ledger, logs, error, steps):
 
 
 @pytest.mark.usefixtures("clock")
-@pytest.mark.parametrize("error", [OSError("no such asset"), MemoryError("buffer"), th.OutOfMemoryError("GPU")])
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError("no such asset"),
+        MemoryError("buffer"),
+        th.OutOfMemoryError("GPU"),
+        ConnectionResetError("simulator"),
+        BrokenPipeError("simulator"),
+        PermissionError("logs"),
+        FileExistsError("logs"),
+        ImportError("no Box2D"),
+        DependencyNotInstalled("no Box2D"),
+    ],
+)
 @pytest.mark.parametrize(("steps", "attempts"), [(0, 3), (50, 4)])
 def test_a_run_that_ends_its_processes_every_time_at_the_same_step_fails(tmp_path, error, steps, attempts):
     ledger = Ledger(InMemoryStorage(), "study", GRACE)
@@ -134,9 +147,7 @@ def test_a_run_that_gets_further_each_time_is_no_failure(tmp_path):
         OSError(errno.ENOSPC, "No space left"),
         OSError(errno.ESTALE, "Stale file handle"),
         OSError(errno.EMFILE, "Too many open files"),
-        PermissionError("logs"),
-        ImportError("no Box2D"),
-        ConnectionError("database"),
+        StorageError("database"),
     ],
 )
 def test_an_error_of_every_run_is_never_a_failure(tmp_path, error):

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import time
+from functools import partial
 from multiprocessing import get_context
 
 import grpc
@@ -20,7 +21,7 @@ from studies import GRACE, assert_each_run_once, make_sweep, pretend_to_train
 from benchmark.sweeps import storages
 from benchmark.sweeps import worker_loop as worker
 from benchmark.sweeps.heartbeats import PROGRESS
-from benchmark.sweeps.storages import open_storage, patiently, reason_of, without_password
+from benchmark.sweeps.storages import StorageError, open_storage, patiently, reason_of, without_password
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.worker_loop import execute_runs
 
@@ -84,8 +85,9 @@ def test_patience_has_an_end(clock):
     def call():
         raise StorageInternalError("away")
 
-    with pytest.raises(StorageInternalError):
-        patiently(call, patience=20.0)
+    with pytest.raises(StorageError, match=r"^away$") as error:
+        patiently(partial(patiently, call, patience=1.0), patience=20.0)
+    assert isinstance(error.value.__cause__, StorageError)
     assert 10 < clock.now <= 20
 
 

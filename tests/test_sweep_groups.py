@@ -8,6 +8,7 @@ from studies import GRACE, Clock, Heart, make_sweep
 
 from benchmark.sweep import parse
 from benchmark.sweeps import worker_loop as worker
+from benchmark.sweeps.attempts import outcome_of
 from benchmark.sweeps.execution import worker_command
 from benchmark.sweeps.groups import ON_GPU, Groups, population_size
 from benchmark.sweeps.run import begin, run_folder
@@ -164,6 +165,15 @@ def test_interrupted_runs_go_on_before_others_begin(ledger, tmp_path, size):
     assert claim(ledger, tmp_path, size)[1:] == (None, [2])
     # Seed 0, whose process was stopped before its first state, keeps its place
     assert claim(ledger, tmp_path, size)[2] == [0, 3][:size]
+
+
+def test_a_run_that_an_error_has_ended_waits_for_all_others_whatever_its_progress(ledger, tmp_path):
+    (taken,), _, _ = claim(ledger, tmp_path, 1)
+    ledger.beat(taken, "beat", 50, 1.0)
+    begin(taken.run, run_folder(tmp_path, "study", taken.run))
+    StateStore(run_folder(tmp_path, "study", taken.run) / "state").save(50, {})
+    ledger.release(taken, outcome_of(BrokenPipeError("simulator")))
+    assert [claim(ledger, tmp_path, 1)[2] for _ in range(4)] == [[1], [2], [3], [0]]
 
 
 def test_sessions_shorter_than_a_run_finish_one_run_after_another(ledger, tmp_path):

@@ -81,7 +81,7 @@ def test_a_lost_configuration_is_taken_up_by_another_process(work, pretend, tmp_
     assert runs == [("trial-0", 0), ("trial-0", 1)]
 
 
-@pytest.mark.parametrize("error", [OSError("no such asset"), MemoryError("buffer")])
+@pytest.mark.parametrize("error", [OSError("no such asset"), MemoryError("buffer"), BrokenPipeError("simulator")])
 def test_a_configuration_that_ends_its_processes_every_time_fails_and_the_next_is_trained(work, pretend, error):
     storage = InMemoryStorage()
 

@@ -4,11 +4,10 @@ import errno
 from collections.abc import Iterable
 
 import torch as th
-from gymnasium.error import DependencyNotInstalled
 from optuna.trial import FrozenTrial, TrialState
 
 from benchmark.sweeps.heartbeats import PROGRESS
-from benchmark.sweeps.storages import STORAGE_ERRORS
+from benchmark.sweeps.storages import StorageError
 from benchmark.sweeps.study_trials import LOST, OUTCOME, STOPPED
 from benchmark.sweeps.tuning import SCORES
 
@@ -18,10 +17,7 @@ SUSPECT, DISSOLVED = "given back after an error: ", "dissolved: "
 # Attempts one after another without progress after which a run is given up
 MOST = 3
 # Errors that every run of the machine would have
-OF_ALL_RUNS = (
-    *(*STORAGE_ERRORS, ImportError, DependencyNotInstalled, PermissionError, FileExistsError),
-    th.AcceleratorError,
-)
+OF_ALL_RUNS = (StorageError, th.AcceleratorError)
 # Of a disk that is full, read-only, broken or gone, and of too many open files
 SYSTEM_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ESTALE, errno.ENODEV, errno.ENXIO),
@@ -48,6 +44,17 @@ def outcome_of(error: Exception) -> str:
     """
     is_of_all = isinstance(error, OF_ALL_RUNS) or getattr(error, "errno", None) in SYSTEM_ERRORS
     return STOPPED if is_of_all else SUSPECT + in_words(error)
+
+
+def ended_by_error(attempts: Iterable[FrozenTrial]) -> bool:
+    """
+    Return whether the last attempt that has ended was ended by a suspected error.
+
+    :param attempts: the trials of a run, in their order
+    :return: whether another one may end its process, too
+    """
+    outcomes = [trial.user_attrs[OUTCOME] for trial in attempts if OUTCOME in trial.user_attrs]
+    return bool(outcomes) and outcomes[-1].startswith(SUSPECT)
 
 
 def fruitless(attempts: Iterable[FrozenTrial]) -> int:

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from benchmark.sweeps.storages import STORAGE_ERRORS, reason_of
+from benchmark.sweeps.storages import StorageError
 
 
 @contextmanager
@@ -20,9 +20,8 @@ def errors_in_words(*faults: type[Exception]) -> Iterator[None]:
         yield
     except faults as error:
         sys.exit(f"Error: {error}")
-    except STORAGE_ERRORS as error:
-        sys.exit(f"Error: the storage does not answer: {reason_of(error)}. When it does, the same command continues.")
-    # After the storage's errors, of which ConnectionError is one
+    except StorageError as error:
+        sys.exit(f"Error: the storage does not answer: {error}. When it does, the same command continues.")
     except OSError as error:
         sys.exit(f"Error: {error}")
     except KeyboardInterrupt:

@@ -4,7 +4,8 @@ Groups of runs that one process trains as a population, and which runs a process
 A process takes the first run that waits and, with it, runs that have the same common settings, up to the size of a
 population. First are the runs with a saved state on this machine, then those that have not begun by their place in the sweep,
 so that processes that end before a run does finish one run after another, then those that another machine may continue. Last
-are those whose last attempts came to nothing, as they may end this process, too. Three kinds of runs are exceptions:
+are those whose last attempt ended in an error, or whose last attempts came to nothing: they may end this process, too. Three
+kinds of runs are exceptions:
 
 - A run whose population has a saved state on this machine goes on as an agent of that population, whatever the size is now.
   All of the population's runs that wait are taken together. None of them is taken while another one is still being trained,
@@ -28,7 +29,7 @@ from optuna.trial import FrozenTrial, TrialState
 from stable_baselines3.common.utils import get_device
 
 from benchmark.common.arguments import count
-from benchmark.sweeps.attempts import DISSOLVED, fruitless
+from benchmark.sweeps.attempts import DISSOLVED, ended_by_error, fruitless
 from benchmark.sweeps.heartbeats import PROGRESS, TrialLostError
 from benchmark.sweeps.run import has_state, run_folder
 from benchmark.sweeps.runs import Run
@@ -196,12 +197,13 @@ class Groups:
         begun = {trial.number: group for trial in own if (group := self._begun(trial, names)) is not None}
         alone = {trial.number for trial in own if trial.number not in begun and self._has_state(trial)}
 
-        def place(trial: FrozenTrial) -> tuple[int, bool, bool, bool, int]:
+        def place(trial: FrozenTrial) -> tuple[int, bool, bool, bool, bool, int]:
             of_run = attempts[trial.user_attrs[KEY]]
             has_state = trial.number in begun or trial.number in alone
             # Another machine may continue it
             is_elsewhere = not has_state and any(PROGRESS in each.user_attrs for each in of_run)
-            return fruitless(of_run), trial.number not in begun, not has_state, is_elsewhere, of_run[0].number
+            is_risky = ended_by_error(of_run)
+            return fruitless(of_run), is_risky, trial.number not in begun, not has_state, is_elsewhere, of_run[0].number
 
         waiting.sort(key=place)
         # By trial, what it has in common with others; only of those that may begin in a population

@@ -37,8 +37,8 @@ from sb3_cgp.zoo.resumed_run import ResumedExperiment
 
 # The file in a run's folder with the run that its states belong to
 RUN_FILE = "run.json"
-# Errors that are no fault of the run: of the database, the disk, a missing package, too little memory, or a GPU, which no
-# training of the same process can use after such an error
+# Errors that may be no fault of the run: of the database, a simulator's connection, the disk, a missing package, too little
+# memory, or a GPU, which no training of the same process can use after such an error
 MACHINE_ERRORS = (
     *(*STORAGE_ERRORS, OSError, ImportError, DependencyNotInstalled, MemoryError, th.OutOfMemoryError, th.AcceleratorError),
 )

@@ -21,8 +21,13 @@ from sb3_cgp.common.extras import how_to_install
 
 Result = TypeVar("Result")
 
-# Errors of the database, and not of the call. Optuna does not convert all of SQLAlchemy's errors.
-STORAGE_ERRORS = (optuna.exceptions.StorageInternalError, SQLAlchemyError, grpc.RpcError, ConnectionError)
+
+class StorageError(RuntimeError):
+    """A storage has not answered for as long as a call was patient. Only calls of storages raise it, no environment does."""
+
+
+# Errors of the database, and not of the call, if a storage raises them. Optuna does not convert all of SQLAlchemy's errors.
+STORAGE_ERRORS = (StorageError, optuna.exceptions.StorageInternalError, SQLAlchemyError, grpc.RpcError, ConnectionError)
 DEFAULT_STORAGE = "sqlite:///logs/sweeps/studies.db"
 # Seconds that SQLite waits for another process's writing
 SQLITE_TIMEOUT = 120
@@ -39,6 +44,7 @@ def open_storage(url: str, create: bool = True) -> BaseStorage:
     :return: the storage
     :raises ValueError: if it is neither, the database's driver is not installed, the database is in memory, or its file is
         missing and not to be created
+    :raises StorageError: if the database does not answer
     """
     parts = urlsplit(url)
     if parts.scheme == "grpc":
@@ -117,7 +123,7 @@ def _open_sqlite(database: URL) -> RDBStorage:
     path = Path(database.database)
     path.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        if not _has_tables(database):
+        if not patiently(_has_tables, database, patience=0.0):
             # On a file system without locks, processes collide, and repeat what has failed
             with suppress(OSError, NotImplementedError):
                 stack.enter_context(FileLock(f"{path}.lock", timeout=SQLITE_TIMEOUT))
@@ -168,7 +174,7 @@ def reason_of(error: BaseException) -> str:
     :param error: one of ``STORAGE_ERRORS``
     :return: the first line of the error that Optuna's error was raised from, or its class if it has no text
     """
-    cause = error.__cause__ or error
+    cause = error if isinstance(error, StorageError) else error.__cause__ or error
     text = cause.details() if isinstance(cause, grpc.Call) else str(cause)
     return text.splitlines()[0] if text else type(cause).__name__
 
@@ -181,9 +187,10 @@ def patiently(call: Callable[..., Result], *args: Any, patience: float = 300.0, 
 
     :param call: a method of the storage
     :param args: its arguments
-    :param patience: seconds after which its error is raised
+    :param patience: seconds after which it is given up
     :param kwargs: its arguments
     :return: the result of the call
+    :raises StorageError: if the database has not answered until then
     """
     start, pause, is_told = time.monotonic(), 0.1, False
     while True:
@@ -191,7 +198,7 @@ def patiently(call: Callable[..., Result], *args: Any, patience: float = 300.0, 
             return call(*args, **kwargs)
         except STORAGE_ERRORS as error:
             if time.monotonic() - start + pause > patience:
-                raise
+                raise StorageError(reason_of(error)) from error
             if not is_told and patience > TABLES_TIMEOUT:
                 print(
                     f"The storage does not answer ({reason_of(error)}): trying for {patience:.0f} s",
