@@ -14,6 +14,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 from readme_renderer import markdown
+from setuptools._distutils.filelist import FileList
 
 ROOT = Path(__file__).parents[1]
 ADDRESS = "https://example.org/someone/sb3-cgp"
@@ -228,3 +229,14 @@ def test_every_answer_names_an_issue_of_its_project_and_a_page_here():
         assert re.fullmatch(rf"https://github.com/{repositories[project]}/(issues|pull)/{number}", address)
     for answer in re.findall(r"^\*\*.*?(?=^\*\*|^## |\Z)", ANSWERS, flags=re.MULTILINE | re.DOTALL):
         assert re.search(r"\]\([a-z_]+\.md[^)]*\)", answer), answer
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="only a clone knows the tracked files")
+def test_the_source_distribution_has_every_file_but_results():
+    command = ["git", "ls-files", "benchmark", "docs", "hyperparams", "tests"]
+    tracked = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.split()
+    files = FileList()
+    files.set_allfiles(tracked)
+    for line in (ROOT / "MANIFEST.in").read_text().splitlines():
+        files.process_template_line(line)
+    assert sorted(name for name in tracked if not name.startswith("benchmark/results/")) == sorted({*tracked} & {*files.files})
