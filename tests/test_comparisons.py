@@ -105,7 +105,7 @@ def test_words(interval: tuple[float, float] | None, number: int, word: str) -> 
 
 def probabilities(table: pd.DataFrame) -> dict[str, str]:
     """Return, by method, the probability that CGP improves on it, on the only task."""
-    written = improvement_table(table, list(dict.fromkeys(table["method"])), 200)
+    written = improvement_table(table, "CGP-Online", list(dict.fromkeys(table["method"])), 200)
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in unpadded(written).splitlines()]
     return {first: rest[0] for first, *rest in cells[2:] if rest}
 
@@ -135,7 +135,9 @@ def test_pairs() -> None:
     ]
     assert pairs_of(["CGP-Online", "TD3"]) == [("CGP-Online", "TD3")]
     assert pairs_of(["CGP-Light", "TD3"]) == [("CGP-Light", "TD3")]
-    assert pairs_of(["TD3", "SAC"]) == []
+    # Of neither of this project's, the first one is compared
+    assert pairs_of(["Random", "TD3", "SAC", "DDPG"]) == [("TD3", "SAC"), ("TD3", "DDPG")]
+    assert pairs_of(["Random", "TD3"]) == pairs_of(["Random"]) == []
 
 
 def test_differences_on_each_task_and_on_all_that_have_enough_runs(tmp_path: Path) -> None:

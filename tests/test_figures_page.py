@@ -17,7 +17,7 @@ from benchmark.reporting import figures as command
 from benchmark.reporting.figures import figures, stability_together, study_folders
 from benchmark.reporting.overview import anchor, finding
 from benchmark.reporting.scores import curves, evaluation_grid, read_study, score_table
-from benchmark.reporting.sections import reward_tables
+from benchmark.reporting.sections import comparison_tables, reward_tables
 
 
 @pytest.fixture
@@ -236,6 +236,17 @@ def test_a_finding_names_the_methods_that_it_is_about(
     assert [
         each.partition("; ")[2].rstrip(".") for each in re.split(r"(?<=[a-zA-Z0-9)])\. ", found) if "; " in each
     ] == sentences
+
+
+def test_methods_of_a_users_own_are_compared(tmp_path: Path) -> None:
+    levels = {"CGP": -50.0, "TQC": -90.0, "PPO": -99.0}
+    study = read_study(write_study(tmp_path / "mine", runs(lambda method, _, seed: levels[method] + seed, levels)))
+    table = score_table([study])
+    assert "CGP: rank 1 of 3; higher than TQC, PPO." in finding(study, table, "Pendulum-v1", 20)
+    differences, tabulated, improvement = comparison_tables(table, study, 20)
+    assert differences == "**Differences between methods**"
+    assert "CGP − TQC" in tabulated
+    assert "Probability that CGP improves on the others" in improvement
 
 
 def test_runs_at_numbers_that_are_none(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations, product
 
 import numpy as np
 import pandas as pd
@@ -51,16 +52,27 @@ def difference_in_words(found: Estimate) -> str:
     return HIGHER if low > 0 else LOWER if high < 0 else NOT_DISTINGUISHABLE
 
 
+def subjects_of(methods: Sequence[str]) -> list[str]:
+    """
+    List the methods that are compared with each other method of a study.
+
+    :param methods: the methods of the study, in order
+    :return: the light setting and the paper's method; the first method that learns in a study of neither
+    """
+    learners = [method for method in methods if method != RANDOM]
+    return [method for method in (LIGHT, OURS) if method in learners] or learners[:1]
+
+
 def pairs_of(methods: Sequence[str]) -> list[tuple[str, str]]:
     """
-    List the pairs whose differences are of interest: the light setting, and the paper's method, with each other method.
+    List the pairs whose differences are of interest: those of :func:`subjects_of` with each other method.
 
     :param methods: the methods of a study, in order
     :return: the pairs, each once, the light setting's first; none with random actions
     """
-    others = [method for method in methods if method not in (LIGHT, OURS, RANDOM)]
-    light = [(LIGHT, other) for other in [OURS, *others] if {LIGHT, other} <= set(methods)]
-    return light + [(OURS, other) for other in others if OURS in methods]
+    subjects = subjects_of(methods)
+    others = [method for method in methods if method not in (*subjects, RANDOM)]
+    return [*combinations(subjects, 2), *product(subjects, others)]
 
 
 def task_difference(table: pd.DataFrame, task: str, pair: tuple[str, str], column: str = "score") -> Estimate | None:
@@ -156,14 +168,15 @@ def _seeds(runs: pd.DataFrame, method: str) -> int:
     return int((runs["method"] == method).sum())
 
 
-def improvement_table(table: pd.DataFrame, methods: Sequence[str], repetitions: int = REPETITIONS) -> str:
+def improvement_table(table: pd.DataFrame, subject: str, methods: Sequence[str], repetitions: int = REPETITIONS) -> str:
     """
-    Tabulate the probability that CGP improves on each other method.
+    Tabulate the probability that a method improves on each other method.
 
     :param table: the runs' scores
-    :param methods: the methods, in the rows' order
+    :param subject: the method
+    :param methods: all methods, in the rows' order
     :param repetitions: number of bootstrap samples
-    :return: the table, in Markdown; empty without CGP or without others
+    :return: the table, in Markdown; empty without runs of the method or of others
     """
     tasks = list(dict.fromkeys(table["task"]))
     rows = []
@@ -172,8 +185,8 @@ def improvement_table(table: pd.DataFrame, methods: Sequence[str], repetitions: 
         found = [
             # Each configuration by itself: a run is compared with runs of the same configuration only
             (
-                compare(scope.assign(task=scope["cell"]), (OURS, method), probability_of_improvement, "score", repetitions)
-                if method != OURS
+                compare(scope.assign(task=scope["cell"]), (subject, method), probability_of_improvement, "score", repetitions)
+                if method != subject
                 else None
             )
             for scope in scopes
@@ -182,9 +195,9 @@ def improvement_table(table: pd.DataFrame, methods: Sequence[str], repetitions: 
             rows.append([method, *(_cell(each) for each in found)])
     if not rows:
         return ""
-    header = [f"{OURS} against", *tasks, *["all tasks"] * (len(tasks) > 1)]
+    header = [f"{subject} against", *tasks, *["all tasks"] * (len(tasks) > 1)]
     note = (
-        f"The probability that a random run of {OURS} has a higher final return than one of the other method with the same "
+        f"The probability that a random run of {subject} has a higher final return than one of the other method with the same "
         "configuration; a tie counts one half (95 % interval). There is no interval where a configuration has fewer than "
         f"{FEWEST_RUNS} runs of a method, or where no draw of the runs changes the number, as where all runs of one "
         "method are above all of the other's: by chance in one case of 35 with 4 runs each. No conclusion rests on this table."

@@ -13,6 +13,7 @@ from benchmark.reporting.comparisons import (
     RANDOM,
     difference_in_words,
     pairs_of,
+    subjects_of,
     task_difference,
 )
 from benchmark.reporting.estimates import (
@@ -26,7 +27,6 @@ from benchmark.reporting.estimates import (
 )
 from benchmark.reporting.scores import Study, score_table
 from benchmark.reporting.sections import heading
-from benchmark.reporting.verdicts import LIGHT, OURS
 
 NOTE = f"""\
 A return is the interquartile mean of the final returns, with its 95 % interval; in a study of hyperparameters, over all of its
@@ -75,7 +75,7 @@ def overview(studies: Sequence[Study], repetitions: int = REPETITIONS) -> str:
 
 def finding(study: Study, table: pd.DataFrame, task: str, repetitions: int = REPETITIONS) -> str:
     """
-    Say which method ended highest on a task, and how this project's methods differ from the others.
+    Say which method ended highest on a task, and how the methods of interest differ from the others.
 
     :param study: the study
     :param table: its runs' scores
@@ -94,7 +94,7 @@ def finding(study: Study, table: pd.DataFrame, task: str, repetitions: int = REP
     sentences = [f"Highest: {levels[0].method}, {levels[0].reward.in_words(form)}."] if len(levels) > 1 else []
     if len(levels) == 1:
         sentences = [f"{levels[0].method}: {levels[0].reward.in_words(form)}."]
-    for ours in (LIGHT, OURS):
+    for ours in subjects_of(study.methods):
         place = next((number for number, level in enumerate(levels) if level.method == ours), None)
         if place is None or len(levels) == 1:
             continue

@@ -12,11 +12,10 @@ import pandas as pd
 from benchmark.common.provenance import conditions_in_words
 from benchmark.common.records import RUNS
 from benchmark.common.tables import markdown_table
-from benchmark.reporting.comparisons import differences_table, improvement_table
+from benchmark.reporting.comparisons import differences_table, improvement_table, subjects_of
 from benchmark.reporting.estimates import FEWEST_RUNS, REPETITIONS, cells_of, estimate, interquartile_mean, number_format
 from benchmark.reporting.literature import literature_section
 from benchmark.reporting.scores import Study, experiment_number, failed, score_table
-from benchmark.reporting.verdicts import OURS
 
 # Kinds of errors that are listed for a study
 ERRORS = 5
@@ -230,9 +229,11 @@ def comparison_tables(table: pd.DataFrame, study: Study, repetitions: int = REPE
     differences = "" if study.axes else differences_table(table, study.methods)
     if differences:
         parts += ["**Differences between methods**", differences]
-    improvement = improvement_table(table, study.methods, repetitions)
-    if improvement:
-        parts.append(fold(f"Probability that {OURS} improves on the others", improvement))
+    # The paper's method, rather than the light setting
+    for subject in subjects_of(study.methods)[-1:]:
+        improvement = improvement_table(table, subject, study.methods, repetitions)
+        if improvement:
+            parts.append(fold(f"Probability that {subject} improves on the others", improvement))
     return parts
 
 
