@@ -1,8 +1,10 @@
 """Writing an entry into a YAML file, in which nothing else changes."""
 
+from functools import partial
+
 import pytest
 
-from benchmark.sweeps.entries import write_entry
+from benchmark.sweeps.entries import check_file, write_entry
 
 OTHERS = """# What this file is
 Ant-v5: &ant  # the ant
@@ -48,15 +50,29 @@ def test_an_entry_is_added(tmp_path, before):
     if before is not None:
         path.parent.mkdir()
         path.write_text(before)
+    check_file(path, "Reacher-v5")
+    assert (path.read_text() if path.exists() else None) == before
     write_entry(path, "Reacher-v5", {"gamma": 0.5}, "tuned")
     kept = "" if not before else before.rstrip("\n") + "\n"
     assert path.read_text() == kept + "Reacher-v5:\n  # tuned\n  gamma: 0.5\n"
 
 
-@pytest.mark.parametrize("before", [OTHERS, "{Ant-v5: {gamma: 1}, Hopper-v5: {gamma: 2}}\n", "- a\n- list\n", "a: [\n"])
-def test_a_file_that_cannot_be_changed_is_left_alone(tmp_path, before):
+@pytest.mark.parametrize(
+    "before",
+    [
+        OTHERS,
+        "{Ant-v5: {gamma: 1}, Hopper-v5: {gamma: 2}}\n",
+        "Hopper-v5: {gamma: 2}\n...\n",
+        "Ant-v5: {gamma: 1}\nAnt-v5: {gamma: 2}\n",
+        "- a\n- list\n",
+        "a: [\n",
+        "# \udcff\n",
+    ],
+)
+def test_a_file_that_cannot_be_changed_is_left_alone_and_refused_before_the_tuning(tmp_path, before):
     path = tmp_path / "mine.yml"
-    path.write_text(before)
-    with pytest.raises(ValueError, match=r"mine.yml is (not changed|no YAML file)"):
-        write_entry(path, "Ant-v5", {"gamma": 0.5}, "tuned")
-    assert path.read_text() == before
+    path.write_text(before, errors="surrogateescape")
+    for change in (partial(check_file, path, "Ant-v5"), partial(write_entry, path, "Ant-v5", {"gamma": 0.5}, "tuned")):
+        with pytest.raises(ValueError, match=r"mine.yml is (not changed|no YAML file)"):
+            change()
+    assert path.read_text(errors="surrogateescape") == before

@@ -86,39 +86,48 @@ def write_entry(path: Path, task: str, entry: Hyperparams, comment: str) -> None
     :param comment: a line on the origin of the hyperparameters
     :raises ValueError: if the file is not one of entries by task, or another entry refers to the one to be replaced
     """
-    # A symbolic link stays one, and lines end as before
+    # A symbolic link stays one
     path = path.resolve()
+    write_atomically(path, _changed(path, task, entry, comment).encode())
+
+
+def check_file(path: Path, task: str) -> None:
+    """
+    Check that :func:`write_entry` could write an entry.
+
+    :param path: the file, which may be missing
+    :param task: the environment
+    :raises ValueError: if it could not
+    """
+    _changed(path.resolve(), task, {"policy": "any"}, "any")
+
+
+def _changed(path: Path, task: str, entry: Hyperparams, comment: str) -> str:
+    """Return a file's text with a task's entry in place of the present one, or after all others."""
     text, before, (start, end) = _read(path, task)
+    # Lines end as before
     ending = "\r\n" if "\r\n" in text else "\n"
     body = yaml.safe_dump(entry, sort_keys=True, allow_unicode=True)
     block = [f"{task}:", f"  # {comment}", *(f"  {line}" for line in body.splitlines())]
     lines = text.splitlines()
     after = ending.join([*lines[:start], *block, *lines[end:]]) + ending
     if _loaded(after) != {**before, task: entry}:
-        raise ValueError(f"{path} is not changed: its entry {task} cannot be replaced without a change of others'")
-    write_atomically(path, after.encode())
-
-
-def check_file(path: Path, task: str) -> None:
-    """
-    Check that a file could take an entry.
-
-    :param path: the file, which may be missing
-    :param task: the environment
-    :raises ValueError: if it is a folder, or no YAML file of entries by task
-    """
-    _read(path.resolve(), task)
+        raise ValueError(
+            f"{path} is not changed: its entry {task} cannot be written without a change of others'. Entries must begin on "
+            "lines of their own, each task's once, without an anchor that others refer to, and without a final `...`"
+        )
+    return after
 
 
 def _read(path: Path, task: str) -> tuple[str, dict[str, Any], tuple[int, int]]:
     """Return a file's text, its entries, and the lines of a task's entry, as :func:`_lines_of` does."""
     if path.is_dir():
         raise ValueError(f"{path} is a folder, and must be a YAML file")
-    text = path.read_bytes().decode() if path.is_file() else ""
     try:
+        text = path.read_bytes().decode() if path.is_file() else ""
         entries = yaml.safe_load(text) or {}
         lines = _lines_of(task, text)
-    except yaml.YAMLError as error:
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
         raise ValueError(f"{path} is no YAML file: {error}") from error
     if not isinstance(entries, dict):
         raise ValueError(f"{path} is not changed: it must be a mapping of tasks to their entries")
