@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from benchmark.common.records import RUNS, read_records
 from benchmark.reporting.figures import draw, minutes_caption
 from benchmark.reporting.interactive import figure
-from benchmark.reporting.learning_curves import curves_by_minutes, times_of
+from benchmark.reporting.learning_curves import curves_by_minutes, first_training_step, times_of
 from benchmark.reporting.scores import Study, read_study
 
 
@@ -50,6 +50,18 @@ def test_random_steps_at_the_start_need_no_time(tmp_path: Path, drawn: list[Figu
     }  # fmt: skip
     (trace,) = (each for each in interactive_lines(chosen) if each["name"] == "TD3")
     assert trace == {"name": "TD3", "minutes": [0.0, 0.0, 4.0, 8.0]}
+
+
+def test_the_default_number_of_random_steps_is_the_algorithms(tmp_path: Path) -> None:
+    configurations = {"TD3": {"algo": "td3"}, "CGP": {"algo": "cgp", "learning_starts": 50}, "PPO": {"algo": "ppo"}}
+    chosen = study(tmp_path, [timed(method, 0, 8.0) for method in configurations], configurations=configurations)
+    assert times_of(chosen, "Pendulum-v1").random_steps == {"TD3": 100, "CGP": 50, "PPO": 0}
+    assert first_training_step(chosen) == 100
+
+
+def test_a_run_that_is_longer_than_planned_has_the_time_of_all_its_steps(tmp_path: Path) -> None:
+    longer = replace(timed("PPO", 0, 8.0), timesteps=[500, 1_000, 1_500, 2_000])
+    assert times_of(study(tmp_path, [longer]), "Pendulum-v1").minutes_per_step == {"PPO": 8.0 / 2_000}
 
 
 def test_offline_variants_have_no_minutes(tmp_path: Path, drawn: list[Figure]) -> None:

@@ -36,6 +36,20 @@ def read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str
     return dict(hyperparams)
 
 
+def random_steps(algo: str, hyperparams: Mapping[str, Any]) -> int:
+    """
+    Return the number of random steps at the start of a run.
+
+    :param algo: the algorithm's name in rl_zoo3
+    :param hyperparams: the run's hyperparameters
+    :return: ``learning_starts``, or its default; 0 for an algorithm that has none, or that is not known
+    """
+    register()
+    parameters = inspect.signature(ALGOS[algo]).parameters if algo in ALGOS else {}
+    default = parameters["learning_starts"].default if "learning_starts" in parameters else 0
+    return int(hyperparams.get("learning_starts", default))
+
+
 def shortened_warm_up(algo: str, hyperparams: Mapping[str, Any], steps: int) -> dict[str, int]:
     """
     Return the hyperparameter by which at most a tenth of a shortened run's steps are random.
@@ -45,10 +59,8 @@ def shortened_warm_up(algo: str, hyperparams: Mapping[str, Any], steps: int) -> 
     :param steps: environment steps of the run
     :return: ``learning_starts``; nothing where no more steps are random than that
     """
-    parameter = inspect.signature(ALGOS[algo]).parameters.get("learning_starts")
-    default = 0 if parameter is None else parameter.default
     most = steps // 10
-    return {"learning_starts": most} if hyperparams.get("learning_starts", default) > most else {}
+    return {"learning_starts": most} if random_steps(algo, hyperparams) > most else {}
 
 
 def warm_up_in_words(steps: int, learning_starts: int, remedy: str) -> str:

@@ -115,9 +115,11 @@ def times_of(study: Study, task: str) -> Times:
     complete = [record for record in measured if not failed(record)]
     compared = _on_one_processor(study, complete)
     seconds: dict[str, list[float]] = {}
-    random_steps = {method: int(_entry(study, method, task).get("learning_starts", 0)) for method in shown}
+    random_steps = {method: _random_steps(_entry(study, method, task)) for method in shown}
     for record in compared:
-        trained = max(record.steps - random_steps[record.method], 1)
+        # Some algorithms train for longer than they are told
+        steps = max([record.steps, *record.timesteps])
+        trained = max(steps - random_steps[record.method], 1)
         seconds.setdefault(record.method, []).append((record.processor_seconds or 0.0) / trained)
     paces = {method: float(np.median(each)) / 60 for method, each in seconds.items()}
     kept = [record for record in measured if record.method in paces]
@@ -178,6 +180,16 @@ def _entry(study: Study, method: str, task: str) -> dict[str, Any]:
     return entries_by_task(study.facts).get((method, task), {})
 
 
+def _random_steps(entry: dict[str, Any]) -> int:
+    """Return the number of random steps at the start of a configuration's runs."""
+    if "learning_starts" in entry or "algo" not in entry:
+        return int(entry.get("learning_starts", 0))
+    # rl_zoo3 takes a second to import, and only defaults need it
+    from benchmark.common.zoo import random_steps
+
+    return random_steps(entry["algo"], entry)
+
+
 def _figure(
     study: Study, task: str, records: Sequence[Record], place: Callable[[str, np.ndarray], np.ndarray], repetitions: int
 ) -> tuple[Figure, dict[str, Axes]]:
@@ -222,7 +234,7 @@ def first_training_step(study: Study) -> int:
     :return: the most random steps at the start that one of its configurations takes
     """
     configurations = study.facts.get("configurations", {}).values()
-    return max((int(entry.get("learning_starts", 0)) for entry in configurations), default=0)
+    return max(map(_random_steps, configurations), default=0)
 
 
 def show_learnt_range(panel: Axes, study: Study, grid: np.ndarray, lines: Sequence[np.ndarray]) -> None:
