@@ -65,6 +65,14 @@ def test_curve_of_a_failed_run_goes_on_at_the_floor() -> None:
     assert lines.tolist() == [[1.0, 2.0, 4.0, 8.0], [3.0, 5.0, 1.0, 1.0]]
 
 
+def test_curves_end_where_the_first_run_ends() -> None:
+    """Some algorithms train for longer than they are told."""
+    records = [record("TD3", 0, 4.0, returns=[1.0, 4.0]), record("PPO", 0, 3.0, returns=[0.0, 1.0, 2.0, 3.0])]
+    records.append(record("PPO", 1, None, returns=[2.0]))
+    grid = evaluation_grid(records, "Pendulum-v1")
+    assert curves(records, 0.0, grid).tolist() == [[1.0, 4.0], [0.0, 1.0], [2.0, 0.0]]
+
+
 def test_stability_is_a_count_of_runs() -> None:
     rng = np.random.default_rng(0)
     cells = [rng.integers(10, size=4).astype(float) for _ in range(6)]

@@ -110,6 +110,17 @@ def test_the_papers_sweeps_have_values_that_their_methods_take(name):
     check_values(load_sweep(name, {"tasks": ["Pendulum-v1"]}))
 
 
+def test_runs_that_learn_nothing_or_are_longer_than_the_others_are_warned_of(tmp_path, capsys):
+    def warnings(name, **hyperparams):
+        path = write_sweep(tmp_path, methods=method(name, **hyperparams), steps=100, evaluation_interval=50)
+        check_values(load_sweep(path))
+        return capsys.readouterr().err
+
+    assert "M learns nothing, as all of its 100 steps are random (learning_starts=100)" in warnings("td3", learning_starts=100)
+    assert "M trains for 128 steps in place of 100, as 64 are between its updates" in warnings("ppo", n_steps=64)
+    assert warnings("td3", learning_starts=99) == warnings("ppo", n_steps=50) == warnings("random") == ""
+
+
 def test_checked_values_need_neither_memory_nor_files(tmp_path, monkeypatch):
     sizes = []
     monkeypatch.setattr("stable_baselines3.TD3._setup_model", lambda self: sizes.append(self.buffer_size))

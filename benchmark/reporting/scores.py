@@ -244,13 +244,16 @@ def score_table(studies: Sequence[Study]) -> pd.DataFrame:
 
 def evaluation_grid(records: Iterable[Record], task: str) -> np.ndarray:
     """
-    List when a task's runs were evaluated.
+    List when a task's runs were evaluated, as long as all of those that did not fail were: some algorithms train for longer
+    than they are told.
 
     :param records: the runs
     :param task: the task
-    :return: environment steps (E) of all evaluations; none if every run failed before its first
+    :return: environment steps (E) of all evaluations until then; none if every run failed before its first
     """
-    return np.unique([step for record in records if record.task == task for step in record.timesteps]).astype(float)
+    runs = [record for record in records if record.task == task and record.timesteps]
+    last = min((record.timesteps[-1] for record in runs if not failed(record)), default=math.inf)
+    return np.unique([step for record in runs for step in record.timesteps if step <= last]).astype(float)
 
 
 def curves(records: Sequence[Record], floor: float, grid: np.ndarray) -> np.ndarray:

@@ -13,9 +13,11 @@ import yaml
 from optuna.samplers import RandomSampler
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from benchmark.common.zoo import silence
+from benchmark.common.zoo import random_steps, silence
 from benchmark.sweeps.experiments import Sweep
 from benchmark.sweeps.hyperparameters import problems
 from benchmark.sweeps.runs import Run
@@ -30,17 +32,37 @@ N_SAMPLES = 10
 
 def check_values(sweep: Sweep) -> None:
     """
-    Construct a model of each configuration, as values may be wrong that have the right names and types.
+    Construct a model of each configuration, as values may be wrong that have the right names and types, and warn of runs that
+    learn nothing, or that are longer than the others.
 
     :param sweep: the sweep
     :raises SweepError: if a model cannot be constructed; it names the sweep's file, the configuration and the error
     """
+    found: dict[str, None] = {}
     for run in _representatives(sweep):
         try:
-            construct(run)
+            model = construct(run)
         except Exception as error:
             place = f"{run.configuration} on {run.task}"
             raise SweepError(sweep.path or sweep.name, place, f"no model can be made: {_in_words(error)}") from error
+        found |= dict.fromkeys(_doubts(run, model))
+    for doubt in found:
+        print(f"Warning: {sweep.path or sweep.name}: {doubt}", file=sys.stderr)
+
+
+def _doubts(run: Run, model: BaseAlgorithm) -> Iterator[str]:
+    """List what a run's length and its hyperparameters make of it that its results would not show."""
+    starts = random_steps(run.algo, run.hyperparams)
+    if starts >= run.steps:
+        yield f"{run.method} learns nothing, as all of its {run.steps:,} steps are random (learning_starts={starts})"
+    if isinstance(model, OnPolicyAlgorithm):
+        between = model.n_steps * model.n_envs
+        if surplus := -run.steps % between:
+            yield (
+                f"{run.method} trains for {run.steps + surplus:,} steps in place of {run.steps:,}, as {between:,} are "
+                "between its updates; its final returns are those after all of them. To avoid it, set n_steps, or steps that "
+                f"are a multiple of {between}"
+            )
 
 
 def check_tuning(tuning: Tuning) -> None:
@@ -88,11 +110,12 @@ def _representatives(sweep: Sweep) -> Iterator[Run]:
             yield run
 
 
-def construct(run: Run) -> None:
+def construct(run: Run) -> BaseAlgorithm:
     """
     Construct the model of a run as rl_zoo3 does, without training it.
 
     :param run: the run, whose environment is registered
+    :return: the model, whose environments are closed
     :raises Exception: all errors of the environment and the algorithm
     """
     hyperparams: dict[str, Any] = {"n_timesteps": run.steps, **run.hyperparams}
@@ -117,3 +140,4 @@ def construct(run: Run) -> None:
         model, _ = manager.setup_experiment()  # type: ignore[misc]
         assert model.env is not None
         model.env.close()
+        return model
