@@ -73,6 +73,13 @@ def test_curves_end_where_the_first_run_ends() -> None:
     assert curves(records, 0.0, grid).tolist() == [[1.0, 4.0], [0.0, 1.0], [2.0, 0.0]]
 
 
+def test_configurations_that_agree_in_many_digits_are_kept_apart(tmp_path: Path) -> None:
+    records = [record("TD3", seed, 1.0, settings={"gamma": gamma}) for gamma in (0.9999999, 1.0, 0.001) for seed in (0, 1)]
+    table = score_table([study(tmp_path, records)])
+    assert table.groupby("cell").size().tolist() == [2, 2, 2]
+    assert list(table["settings"].unique()) == ["gamma 0.9999999", "gamma 1", "gamma 0.001"]
+
+
 def test_stability_is_a_count_of_runs() -> None:
     rng = np.random.default_rng(0)
     cells = [rng.integers(10, size=4).astype(float) for _ in range(6)]

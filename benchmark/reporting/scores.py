@@ -172,7 +172,9 @@ def value_in_words(value: Any) -> str:
     :return: its name for people
     """
     if isinstance(value, float):
-        return f"{value:g}"
+        short = f"{value:g}"
+        # Other values must not have the same name
+        return short if float(short) == value else repr(value)
     return value if isinstance(value, str) else json.dumps(value).replace('"', "")
 
 
