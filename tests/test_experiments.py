@@ -15,7 +15,7 @@ from benchmark.common.zoo import read_entry
 from benchmark.sweeps.experiments import included_sweeps, load_sweep, sweeps_folder
 from benchmark.sweeps.processes import share_of_cores, start_workers
 from benchmark.sweeps.runs import overview
-from benchmark.sweeps.validation import SweepError
+from benchmark.sweeps.validation import SweepError, read_yaml
 
 ROOT = Path(__file__).parent.parent
 GOOD = dict(title="A sweep", methods=["TD3", "CGP-Online"], tasks=["Pendulum-v1"], steps=100, seeds=2, evaluation_interval=10)
@@ -288,6 +288,12 @@ def test_a_subset_of_seeds_and_a_checkpoint_interval(sweep_of):
             "'high' of A (sac) must be a number",
         ),
         (dict(axes={"cem_samples": {"values": [8]}}), "cem_samples", "of TD3"),
+        (dict(hyperparams={"learning_rate": "cos_1e-3"}), "learning_rate", "or a linear schedule, such as lin_0.001"),
+        (dict(methods={"A": {"algo": "ppo", "hyperparams": {"clip_range_vf": "const_0.1"}}}), "clip_range_vf", "lin_0.001"),
+        (dict(axes={"gamma": {"values": [0.5]}}, exclude=[{"gamma": 0.5}]), "exclude", "leaves no combination"),
+        (dict(seeds="0-3"), "seeds", "must be a number of seeds, or a list of seeds, such as [0, 1, 2, 3]"),
+        (dict(axes={"a": {"values": {True: {}}}}), "axes.a.values", "it is True, as YAML reads it: write it in quotes"),
+        (dict(axes={"a": {"values": {32: {}}}}), "axes.a.values", "it is 32, as YAML reads it: write it in quotes"),
     ],
 )
 def test_a_mistake_is_named_with_what_is_allowed(tmp_path, sweep_of, changes, key, allowed):
@@ -344,6 +350,21 @@ def test_a_file_that_is_no_mapping(tmp_path):
     (tmp_path / "mine.yml").write_text("a: [")
     with pytest.raises(SweepError, match="cannot be read"):
         load_sweep(str(tmp_path / "mine.yml"))
+    (tmp_path / "mine.yml").write_bytes(b"title: caf\xe9")
+    with pytest.raises(SweepError, match=r"mine\.yml: cannot be read: 'utf-8' codec can't decode byte 0xe9"):
+        load_sweep(str(tmp_path / "mine.yml"))
+
+
+@pytest.mark.parametrize("text", ["title: A\nseeds: 1\nseeds: 2\n", "methods:\n  A: {algo: td3}\n  A: {algo: sac}\n"])
+def test_a_key_that_is_given_twice_is_refused(tmp_path, text):
+    (tmp_path / "mine.yml").write_text(text)
+    with pytest.raises(SweepError, match=r"cannot be read: the key '(seeds|A)' is given twice\n.*line 3"):
+        load_sweep(str(tmp_path / "mine.yml"))
+
+
+def test_a_key_that_replaces_a_merged_one_is_given_once(tmp_path):
+    (tmp_path / "mine.yml").write_text("deep: {a: &a {x: 1}, b: &b {<<: *a, x: 2}}\ntop: {<<: *b, x: 3}\n")
+    assert read_yaml(tmp_path / "mine.yml")["top"] == {"x": 3}
 
 
 def test_a_file_with_the_name_of_one_of_the_projects_sweeps_is_warned_of(tmp_path, capsys):

@@ -86,7 +86,7 @@ def method(algo, **hyperparams):
         (dict(methods=method("td3", policy="MlpPolcy")), ["M on Pendulum-v1", "MlpPolcy"]),
         (dict(methods=method("td3", policy_kwargs="dict(net_arch=[8, '8'])")), ["M on Pendulum-v1", "TypeError"]),
         (dict(methods=method("sac", policy_kwargs="dict(net_arch=[8")), ["M on Pendulum-v1", "SyntaxError"]),
-        (dict(methods=method("td3", learning_rate="linear")), ["M on Pendulum-v1", "ValueError"]),
+        (dict(methods=method("td3", learning_rate="lin_ear")), ["M on Pendulum-v1", "ValueError"]),
         (dict(methods=method("td3", noise_type="loud", noise_std=0.1)), ["M on Pendulum-v1", "loud"]),
         (dict(methods=method("td3", train_freq=[1, "stepp"])), ["M on Pendulum-v1", "stepp"]),
         (dict(methods=method("td3", buffer_size=10.5)), ["M on Pendulum-v1", "TypeError"]),

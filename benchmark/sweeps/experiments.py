@@ -251,6 +251,8 @@ def load_sweep(name: str, overrides: dict[str, Any] | None = None, methods: Sequ
     sweep = Sweep(
         path.stem, file, {method: known[method] for method in chosen}, path=path, is_shortened=file.steps < own_steps
     )
+    if not sweep.runs():
+        raise SweepError(path, "exclude", "leaves no combination of the axes' values")
     replaced = _replaced_hyperparams(sweep)
     for key, axes in replaced.items():
         place = "--set" if key in changed else path
@@ -269,7 +271,7 @@ def _replaced_hyperparams(sweep: Sweep) -> dict[str, str]:
     """Return the hyperparameters for all methods that axes replace in every run, with the axes in words."""
     file, runs = sweep.file, sweep.runs()
     found = {}
-    for key in file.hyperparams if runs else ():
+    for key in file.hyperparams:
         setting = [
             [axis for axis, value in run.settings.items() if key in file.axes[axis].hyperparams(axis, value, run.method)]
             for run in runs

@@ -40,6 +40,9 @@ def problems(method: str, algo: str, hyperparams: dict[str, Any]) -> Iterator[tu
         is_number = isinstance(default, int | float) and not isinstance(default, bool)
         if isinstance(value, str) and is_number and name not in SCHEDULES:
             yield name, f"{value!r} of {method} ({algo}) must be a number, such as the default, {default!r}"
+        if isinstance(value, str) and name in SCHEDULES and not value.startswith("lin_"):
+            # rl_zoo3 ignores the word
+            yield name, f"{value!r} of {method} ({algo}) must be a number, or a linear schedule, such as lin_0.001"
 
 
 def _numbers_as_text(value: Any) -> Iterator[str]:

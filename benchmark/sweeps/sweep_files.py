@@ -4,7 +4,7 @@ from string import Template
 from typing import Annotated, Any, ClassVar
 
 from huggingface_sb3 import EnvironmentName
-from pydantic import AfterValidator, BaseModel, Field, PositiveInt, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, PositiveInt, model_validator
 from rl_zoo3 import ALGOS
 
 from benchmark.common.environments import (
@@ -59,6 +59,13 @@ def _with_numbers(hyperparams: Hyperparams) -> Hyperparams:
     if not isinstance(starts, int | float):
         raise ValueError(f"`learning_starts` must be a number, and not {starts!r}")
     return hyperparams
+
+
+def _number_or_list(seeds: Any) -> Any:
+    # Pydantic reads 0-3 as -3
+    if isinstance(seeds, str) and not seeds.isdecimal():
+        raise ValueError("must be a number of seeds, or a list of seeds, such as [0, 1, 2, 3]")
+    return seeds
 
 
 def _all_different(values: list[Any]) -> list[Any]:
@@ -179,10 +186,11 @@ class SweepFile(Strict):
         AfterValidator(_with_distinct_names),
     ]
     steps: PositiveInt
-    seeds: (
+    seeds: Annotated[
         PositiveInt
-        | Annotated[list[Annotated[int, Field(ge=0, lt=2**32)]], Field(min_length=1), AfterValidator(_all_different)]
-    )
+        | Annotated[list[Annotated[int, Field(ge=0, lt=2**32)]], Field(min_length=1), AfterValidator(_all_different)],
+        BeforeValidator(_number_or_list),
+    ]
     evaluation_interval: PositiveInt
     evaluation_episodes: PositiveInt = 10
     checkpoint_interval: PositiveInt | None = None

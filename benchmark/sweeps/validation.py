@@ -17,6 +17,19 @@ class Strict(BaseModel):
     parts: ClassVar[dict[str, type[BaseModel]]] = {}
 
 
+class _Loader(yaml.SafeLoader):
+    """A loader that refuses a key given twice, of which YAML's others take the last."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node = super().compose_mapping_node(anchor)
+        seen = set()
+        for key, _ in node.value:
+            if (key.tag, str(key.value)) in seen:
+                raise yaml.composer.ComposerError(None, None, f"the key {key.value!r} is given twice", key.start_mark)
+            seen.add((key.tag, str(key.value)))
+        return node
+
+
 Model = TypeVar("Model", bound=Strict)
 
 
@@ -42,8 +55,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     :raises SweepError: if it cannot be read, or holds no mapping
     """
     try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, yaml.YAMLError) as error:
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise SweepError(path, "", f"cannot be read: {error}") from error
     if not isinstance(content, dict):
         raise SweepError(path, "", "must be a mapping of keys to values")
@@ -81,6 +94,8 @@ def _location(error: ErrorDetails) -> list[str]:
 
 def _problem(error: ErrorDetails, kind: type[Strict]) -> str:
     given = "" if error["type"] == "missing" or isinstance(error["input"], dict) else f" (it is {error['input']!r})"
+    if error["type"] == "string_type" and isinstance(error["input"], bool | int | float):
+        given = f" (it is {error['input']!r}, as YAML reads it: write it in quotes)"
     if error["type"] == "extra_forbidden":
         owner = kind.parts.get(str(error["loc"][0]), kind)
         return f"is not known: it must be one of {', '.join(owner.model_fields)}"
