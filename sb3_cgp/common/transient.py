@@ -1,4 +1,4 @@
-"""Attributes of a model that belong to its running training: neither a saved model nor a copy has them."""
+"""Attributes that neither a saved model nor a copy has: those of its running training, and what cannot be copied."""
 
 from typing import Any, ClassVar
 
@@ -7,9 +7,10 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 class TransientAttributes(OffPolicyAlgorithm):
     """
-    An algorithm that leaves the attributes of its running training out of saved models and of copies.
+    An algorithm that leaves some attributes out of saved models and of copies.
 
-    Each class lists its own in ``TRANSIENT``, and has in a class attribute of the same name the value without a training.
+    Each class lists its own in ``TRANSIENT``. The value in a copy is a class attribute of the same name, or one that
+    ``__setstate__`` makes.
     """
 
     TRANSIENT: ClassVar[tuple[str, ...]] = ()

@@ -1,7 +1,7 @@
 """CGP whose gradient steps, and whose acting by CEM, are CUDA graphs on a GPU."""
 
 import functools
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -10,25 +10,15 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_cgp.common.rules import require
+from sb3_cgp.common.transient import TransientAttributes
 from sb3_cgp.core.cgp import CGP
 from sb3_cgp.fast.cuda_graphs import RecordedFunction, Tensors, has_cuda_graphs
 from sb3_cgp.fast.recorded_optimizers import CHECK_INTERVAL, LOSSES, LossWatch, is_fused_adam, set_capturable, skip_step_if
 
 SelfCudaGraphAlgorithm = TypeVar("SelfCudaGraphAlgorithm", bound="CudaGraphAlgorithm")
 
-# Attributes that hold graphs or tensors on the device, and are made anew for a copied or loaded model
-TRANSIENT = (
-    "_records_steps",
-    "_recorded_rates",
-    "_recorded",
-    "_recorded_settings",
-    "_loss_watch",
-    "_unlogged",
-    "_watches_losses",
-)
 
-
-class CudaGraphAlgorithm(CGP):
+class CudaGraphAlgorithm(TransientAttributes, CGP):
     """
     CGP whose gradient steps are recorded as CUDA graphs on a GPU, and replayed.
 
@@ -38,6 +28,16 @@ class CudaGraphAlgorithm(CGP):
     than a fused Adam, steps are carried out as usual.
     """
 
+    # Graphs, and tensors on the device, which are made anew for a copied or loaded model
+    TRANSIENT: ClassVar[tuple[str, ...]] = (
+        "_records_steps",
+        "_recorded_rates",
+        "_recorded",
+        "_recorded_settings",
+        "_loss_watch",
+        "_unlogged",
+        "_watches_losses",
+    )
     # The argument of the constructor
     cuda_graphs: bool = True
 
@@ -234,17 +234,8 @@ class CudaGraphAlgorithm(CGP):
         # A state saved now has the losses in its log, and no NaN unreported
         self._report()
 
-    def __getstate__(self) -> dict[str, Any]:
-        # Python has a method of this name since 3.11
-        inherited = getattr(super(), "__getstate__", None)
-        state = vars(self) if inherited is None else inherited()
-        return {name: value for name, value in state.items() if name not in TRANSIENT}
-
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         # Without `_init_setup_model` there are no networks yet
         if "actor" in state:
             self._prepare_graphs()
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), *TRANSIENT]

@@ -4,7 +4,7 @@ import copy
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -34,7 +34,7 @@ class EpisodeGuard(TransientAttributes):
     where a callback or an exception ended a training before the last step was stored.
     """
 
-    TRANSIENT = ("_is_in_rollout",)
+    TRANSIENT: ClassVar[tuple[str, ...]] = ("_is_in_rollout",)
     # Where the model's own last step, or its reset, left the environment; None where that is unknown, as after `load`
     _left_env_at: "_EnvMark | None" = None
     # The step of the training's own that is not stored yet

@@ -1,7 +1,7 @@
 """Gradient steps of a population while its environments take their step."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import RolloutReturn, TrainFreq, TrainFrequencyUnit
@@ -20,6 +20,8 @@ class OverlappedTraining(PopulationTraining):
     steps are taken when the actions have been sent to the environments, so that they cannot sample the newest transition.
     """
 
+    # SB3's wrappers can be neither copied nor pickled. The next rollout makes a new one.
+    TRANSIENT: ClassVar[tuple[str, ...]] = ("_overlapping_env",)
     overlap: bool = False
     _overlapping_env: "_OverlappingEnv | None" = None
     # Whether the gradient steps that SB3's loop would take after this rollout have been taken
@@ -81,15 +83,6 @@ class OverlappedTraining(PopulationTraining):
                 self._has_trained_ahead = True
         finally:
             self.num_timesteps = n_before
-
-    def __getstate__(self) -> dict[str, Any]:
-        # SB3's wrappers can be neither copied nor pickled. The next rollout makes a new one.
-        inherited = getattr(super(), "__getstate__", None)
-        state = vars(self) if inherited is None else inherited()
-        return {name: value for name, value in state.items() if name != "_overlapping_env"}
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_overlapping_env"]
 
 
 class _OverlappingEnv(VecEnvWrapper):

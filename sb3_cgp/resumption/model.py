@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -40,7 +40,7 @@ class RunningTraining:
 class ResumableModel(TransientAttributes):
     """The attributes and methods of a model whose training states can be saved."""
 
-    TRANSIENT = ("_training",)
+    TRANSIENT: ClassVar[tuple[str, ...]] = ("_training",)
     _training = RunningTraining()
     # The loaded state, until the next `learn` has restored it
     resumption: State | None = None
