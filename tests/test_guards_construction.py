@@ -370,7 +370,7 @@ def test_guards_leave_another_algorithms_constructor_as_it_is():
 def test_a_model_of_another_algorithm_is_refused_with_the_remedy(other, tmp_path):
     # SAC adds to the dictionary
     other("MlpPolicy", "Pendulum-v1", **SMALL | dict(policy_kwargs=dict(net_arch=[4]))).save(tmp_path / "model")
-    with pytest.raises(ValueError, match=r"`policy` is .* Load a model of another algorithm by that algorithm's class"):
+    with pytest.raises(ValueError, match=r"`policy` is .* A saved model of another algorithm is loaded by that one's class"):
         CGP.load(tmp_path / "model")
 
 

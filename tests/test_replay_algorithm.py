@@ -242,6 +242,25 @@ def test_a_buffer_that_is_there_before_the_networks_is_kept(tmp_path, algorithm)
     assert loaded.replay_buffer is model.replay_buffer
 
 
+def test_a_buffer_that_was_saved_within_a_model_is_checked_and_moved_to_its_device(tmp_path):
+    model = make_model(Doubles()).learn(40)
+    model.replay_buffer.device = th.device("meta")
+    model.save(tmp_path / "model", include=["replay_buffer"])
+    assert CGP.load(tmp_path / "model", env=Doubles(), device="cpu").learn(40).replay_buffer.device.type == "cpu"
+    with pytest.raises(ValueError, match=r"`replay_buffer` is 'ReplayBuffer', but must be a NStepReplayBuffer"):
+        CGP.load(tmp_path / "model", env=Doubles(), n_steps=3)
+
+
+def test_a_model_whose_networks_could_not_be_made_has_no_buffer():
+    model = make_model(Doubles(), _init_setup_model=False)
+    model.policy_kwargs = dict(net_arch="wide")
+    with pytest.raises(ValueError, match="net_arch"):
+        model._setup_model()
+    model.policy_kwargs = dict(net_arch=[8])
+    model._setup_model()
+    assert model.learn(40).replay_buffer.size() == 40
+
+
 def test_a_buffer_that_was_saved_in_float64_still_trains(tmp_path):
     TD3("MlpPolicy", Doubles(), buffer_size=200, learning_starts=100).learn(60).save_replay_buffer(tmp_path / "buffer")
     model = make_model(Doubles())

@@ -166,6 +166,15 @@ def test_a_run_that_the_keyboard_interrupted_goes_on_although_it_has_a_model(mon
     assert_same(outcome(tmp_path / "stopped"), outcome(tmp_path / "straight"))
 
 
+def test_a_run_that_a_signal_interrupts_at_its_last_step_has_ended(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(Stop, "at", 330)
+    monkeypatch.setattr(Stop, "_on_step", lambda self: self.n_calls < Stop.at or signal.raise_signal(signal.SIGINT) is None)
+    start(monkeypatch, command(tmp_path, callbacks=f"{CHECKPOINT}, 'test_resume_zoo.Stop'"))
+    assert "interrupted at step" not in capsys.readouterr().out
+    resume(run_of(tmp_path))
+    assert "has ended: there is nothing to resume" in capsys.readouterr().out
+
+
 def test_a_policys_training_that_the_keyboard_interrupted_goes_on(monkeypatch, tmp_path):
     monkeypatch.setattr("sb3_cgp.core.offline.ROUND", 10)
     options = dict(policy_training="'offline'", n_timesteps=100)

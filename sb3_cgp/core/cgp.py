@@ -130,7 +130,7 @@ class CGP(OffPolicyAlgorithm):
     def _setup_model(self) -> None:
         # Not in the constructor: `load` sets the saved arguments after it, and calls this method then
         self._check_arguments()
-        allowed = "a subclass of sb3_cgp.CGPPolicy. Load a model of another algorithm by that algorithm's class"
+        allowed = "a subclass of sb3_cgp.CGPPolicy. A saved model of another algorithm is loaded by that one's class"
         require(issubclass(self.policy_class, CGPPolicy), "policy", self.policy_class, allowed)
         super()._setup_model()
         self.actor, self.actor_target = self.policy.actor, self.policy.actor_target

@@ -66,10 +66,15 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         buffer = self.replay_buffer
         # SB3 allocates a buffer unless there is one, and asks for an environment to do so for hindsight replay
         self.replay_buffer = ReplayBuffer.__new__(ReplayBuffer)
-        super()._setup_model()
-        self.replay_buffer = buffer
-        self.replay_buffer_class, self.replay_buffer_kwargs = given
-        if not self._defers_replay_buffer:
+        try:
+            super()._setup_model()
+        finally:
+            self.replay_buffer = buffer
+            self.replay_buffer_class, self.replay_buffer_kwargs = given
+        if buffer is not None:
+            # As SB3 does with a loaded one
+            buffer.device = self.device
+        elif not self._defers_replay_buffer:
             self._ensure_replay_buffer()
 
     def _ensure_replay_buffer(self) -> ReplayBuffer:

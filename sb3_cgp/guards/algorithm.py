@@ -71,6 +71,9 @@ class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
             check_goals(self)
             super()._setup_model()
             self._try_networks()
+        if self.replay_buffer is not None:
+            # One that was saved within the model
+            check_loaded_replay_buffer(self.replay_buffer, self)
 
     def _try_networks(self) -> None:
         """Try the networks that have just been made."""

@@ -25,7 +25,8 @@ def warning_of_missing_seed(env: Any, seed: int | None) -> Iterator[None]:
             f"{kind.__module__}.{kind.__qualname__} has no method `seed`: the random numbers of the environments do not "
             f"follow from `seed={seed}`, so that two trainings with this seed differ. Set the seed where the environments "
             "are made, or give the method `seed(seed)` to a VecEnvWrapper around them.",
-            stacklevel=2,
+            # Of this context's generator, `contextlib` and `set_random_seed`
+            stacklevel=4,
         )
 
 

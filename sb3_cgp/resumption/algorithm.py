@@ -266,9 +266,9 @@ class ResumableAlgorithm(ResumableModel):
                 each.signals.pass_on()
             raise
         else:
+            self._training_has_ended = outer.n_nested == 0
             # The signal came during the last step or the saving of its state. The code after `learn` could take too long.
             self._stop_if_asked()
-            self._training_has_ended = outer.n_nested == 0
         finally:
             for each in self._checkpoints():
                 each.release()

@@ -197,10 +197,10 @@ def is_finished(folder: Path, args: argparse.Namespace, hyperparams: dict[str, A
         return False
     data, _, _ = load_from_zip_file(model, device="cpu")
     assert data is not None
-    # Not in models of earlier commits, of which no harm is done by training them again from their last state
-    has_ended = bool(data.get("_training_has_ended", False))
+    n_done = data["num_timesteps"]
+    # Models of earlier commits do not have it
+    has_ended = bool(data.get("_training_has_ended", n_done >= n_timesteps and not data["_policy_is_due"]))
     if not steps and not has_ended:
-        n_done = data["num_timesteps"]
         raise FileNotFoundError(
             f"The run was interrupted at step {n_done:,} of {n_timesteps:,}, before it saved a state in {states}. {anew}"
         )
