@@ -20,6 +20,7 @@ from studies import GRACE, assert_each_run_once, make_sweep, pretend_to_train
 
 from benchmark.sweeps import storages
 from benchmark.sweeps import worker_loop as worker
+from benchmark.sweeps.endings import errors_in_words
 from benchmark.sweeps.heartbeats import PROGRESS
 from benchmark.sweeps.storages import StorageError, open_storage, patiently, reason_of, without_password
 from benchmark.sweeps.studies import Ledger
@@ -99,6 +100,18 @@ def test_the_reason_of_a_proxy_that_is_away_is_that_of_the_connection():
 
 def test_the_reason_of_an_error_without_a_text_is_its_class():
     assert reason_of(ConnectionError()) == "ConnectionError"
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (StorageError("away"), r"^Error: the storage does not answer: away\. When it does, the same command continues\.$"),
+        (BrokenPipeError("of a simulator"), "^Error: of a simulator$"),
+    ],
+)
+def test_a_command_that_ends_blames_the_storage_for_its_own_errors_only(error, message):
+    with pytest.raises(SystemExit, match=message), errors_in_words():
+        raise error
 
 
 def test_no_patience_with_other_errors(clock):
