@@ -3,6 +3,7 @@
 import io
 import pathlib
 import warnings
+from collections.abc import Mapping
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
@@ -11,7 +12,6 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
-from sb3_cgp.common.load_arguments import saved_attributes
 from sb3_cgp.common.rules import require
 from sb3_cgp.core import cgp as core
 from sb3_cgp.core.policies import CGPPolicy
@@ -27,7 +27,6 @@ from sb3_cgp.guards.argument_names import suggests_names
 from sb3_cgp.guards.arguments import check_callback
 from sb3_cgp.guards.construction import checks_arguments
 from sb3_cgp.guards.explanations import explaining_errors
-from sb3_cgp.guards.file_names import find_file
 from sb3_cgp.guards.losses import LossGuard
 from sb3_cgp.guards.replay_buffer_fit import fit_replay_buffer
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
@@ -316,13 +315,15 @@ class CGP(
             nearest one that is allowed
         :raises IsADirectoryError: if the path is a folder, and there is no zip-file of that name beside it
         """
-        path = find_file(cls, path, "zip")
-        allowed = f"of {cls.__name__}, a single agent: load a population by `sb3_cgp.population.Population.load(path)`"
-        # An attribute `agents` may be the user's
-        require("_agent_updates" not in saved_attributes(path), "path", "a file with the attribute `agents`", allowed)
         if custom_objects is not None and "learning_rate" in custom_objects:
             custom_objects = {"actor_learning_rate": None} | custom_objects
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+    @classmethod
+    def _check_saved(cls, saved: Mapping[str, Any]) -> None:
+        allowed = f"of {cls.__name__}, a single agent: load a population by `sb3_cgp.population.Population.load(path)`"
+        # An attribute `agents` may be the user's
+        require("_agent_updates" not in saved, "path", "a file with the attribute `agents`", allowed)
 
     def set_parameters(
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"

@@ -6,6 +6,7 @@ To add a check, write a function in the file of its subject, or a context manage
 
 import io
 import pathlib
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import torch as th
@@ -14,6 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_cgp.common.load_arguments import saved_attributes
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
 from sb3_cgp.common.spaces import check_action_space
@@ -116,9 +118,14 @@ class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
         :raises ValueError: if the value of an argument of SB3's is wrong, naming it
         """
         path = find_file(cls, path, "zip")
+        cls._check_saved(saved_attributes(path))
         kwargs = effective_load_arguments(cls, path, device, custom_objects, kwargs)
         with explaining_policy_kwargs():
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+    @classmethod
+    def _check_saved(cls, saved: Mapping[str, Any]) -> None:
+        """Check the attributes of a saved model before it is loaded; none of a file that ``load`` refuses."""
 
     def set_parameters(self, load_path_or_dict: Any, *args: Any, **kwargs: Any) -> None:
         """

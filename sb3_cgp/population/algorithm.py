@@ -2,7 +2,7 @@
 
 import io
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -254,11 +254,12 @@ class Population(ResumableAlgorithm, PopulationMembers):
         for name in {"agents", *OWN, *COMMON} & kwargs.keys():
             require(name in ("verbose", "tensorboard_log"), name, kwargs[name], "left out: change it in a new population")
         path = find_file(cls, path, "zip")
-        saved = saved_attributes(path)
-        allowed = f"of {cls.__name__}, a population: load a single agent by its own class, such as `CGP.load(path)`"
-        # `load` refuses a file without any
-        require(not saved or "_agent_updates" in saved, "path", "a file without the attribute `agents`", allowed)
         return super().load(path, cls._make_env(env, path), *args, **kwargs)
+
+    @classmethod
+    def _check_saved(cls, saved: Mapping[str, Any]) -> None:
+        allowed = f"of {cls.__name__}, a population: load a single agent by its own class, such as `CGP.load(path)`"
+        require(not saved or "_agent_updates" in saved, "path", "a file without the attribute `agents`", allowed)
 
     @classmethod
     def _make_env(cls, env: Any, saved: Any) -> Any:
