@@ -1,25 +1,17 @@
 """Studies of runs that took so long, and what is drawn of them."""
 
 from dataclasses import replace
-from pathlib import Path
 
-from finished_studies import record, write_study
+from finished_studies import record
 from matplotlib.axes import Axes
 
 from benchmark.common.records import Record
-from benchmark.reporting.scores import Study, read_study
 
 
 def timed(method: str, seed: int, minutes: float | None, **options: object) -> Record:
     """A run of 1,000 steps, evaluated every 250, that took so long."""
     run = record(method, seed, 40.0, returns=[10.0, 20.0, 30.0, 40.0], **options)  # type: ignore[arg-type]
     return replace(run, processor_seconds=None if minutes is None else 60 * minutes)
-
-
-def study(folder: Path, records: list[Record], **facts: object) -> Study:
-    found = read_study(write_study(folder / "sweep", records))
-    found.facts.update(facts)
-    return found
 
 
 def lines(panel: Axes) -> dict[str, tuple[list[float], list[float]]]:

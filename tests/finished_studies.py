@@ -9,6 +9,7 @@ import torch as th
 
 from benchmark.common.provenance import conditions
 from benchmark.common.records import Record, write_records
+from benchmark.reporting.scores import Study, read_study
 
 STEPS, INTERVAL = 1_000, 250
 GRID = [{"learning_rate": rate, "batch_size": size} for rate in (0.01, 0.001) for size in (64, 32)]
@@ -74,6 +75,13 @@ def write_study(folder: Path, records: list[Record], planned: int | None = None)
     write_records(folder, records)
     (folder / "study.json").write_text(json.dumps(facts))
     return folder
+
+
+def study(folder: Path, records: list[Record], name: str = "sweep", **facts: object) -> Study:
+    """Return a study of some records, as the page reads it, with further facts."""
+    found = read_study(write_study(folder / name, records))
+    found.facts.update(facts)
+    return found
 
 
 def score(method: str, settings: dict[str, Any], seed: int) -> float | None:

@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from finished_studies import record, runs, write_study
+from finished_studies import record, runs, study
 from rliable import metrics
 from rliable.library import get_interval_estimates
 
-from benchmark.common.records import Record
 from benchmark.reporting.estimates import (
     bootstrap,
     cells_of,
@@ -19,11 +18,7 @@ from benchmark.reporting.estimates import (
     probability_of_improvement,
     share_reaching,
 )
-from benchmark.reporting.scores import Study, curves, evaluation_grid, floors, read_study, score_table, settings_in_words
-
-
-def study(folder: Path, records: list[Record], name: str = "sweep") -> Study:
-    return read_study(write_study(folder / name, records))
+from benchmark.reporting.scores import curves, evaluation_grid, floors, score_table, settings_in_words
 
 
 def test_failed_run_counts_with_the_lowest_return_of_any_evaluation_on_its_task(tmp_path: Path) -> None:

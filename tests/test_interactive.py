@@ -4,23 +4,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from finished_studies import record, runs, write_study
+from finished_studies import record, runs, study
 
 from benchmark.common.records import Record
 from benchmark.common.style import METHODS
 from benchmark.reporting.interactive import MINUTES, STEPS, figure
-from benchmark.reporting.scores import Study, read_study
 
 
 def timed(method: str, seed: int, minutes: float | None) -> Record:
     run = record(method, seed, 40.0 + seed, "HalfCheetah-v5", returns=[10.0, 20.0, 30.0, 40.0 + seed])
     return replace(run, processor_seconds=None if minutes is None else 60 * minutes)
-
-
-def study(folder: Path, records: list[Record], **facts: object) -> Study:
-    found = read_study(write_study(folder / "sweep", records))
-    found.facts.update(facts)
-    return found
 
 
 def test_each_method_has_its_seeds_its_mean_and_its_band(tmp_path: Path) -> None:

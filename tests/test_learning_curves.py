@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
-from drawn_studies import lines, study, timed
-from finished_studies import record
+from drawn_studies import lines, timed
+from finished_studies import record, study
 from matplotlib.figure import Figure
 from tables import unpadded
 

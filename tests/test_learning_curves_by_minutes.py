@@ -5,8 +5,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
-from drawn_studies import lines, study, timed
-from finished_studies import record, write_study
+from drawn_studies import lines, timed
+from finished_studies import record, study, write_study
 from matplotlib.figure import Figure
 
 from benchmark.common.records import RUNS, read_records

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn_studies import lines, study, timed
-from finished_studies import record, runs, write_study
+from drawn_studies import lines, timed
+from finished_studies import record, runs, study, write_study
 from matplotlib.figure import Figure
 from tables import unpadded
 
