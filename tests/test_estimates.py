@@ -111,6 +111,14 @@ def test_intervals_hold_the_truth_about_as_often_as_the_page_says() -> None:
     assert 0.85 <= np.mean(held) <= 1.0
 
 
+def test_the_interval_of_four_runs_is_their_range() -> None:
+    rng = np.random.default_rng(5)
+    for number in (4, 5):
+        scores = rng.normal(size=number)
+        is_range = estimate(interquartile_mean, [[scores]], 2_000).interval == (scores.min(), scores.max())
+        assert is_range == (number == 4)
+
+
 def test_runs_are_drawn_within_cells_only() -> None:
     cells = [np.zeros(4), np.full(4, 10.0)]
     assert estimate(lambda scores: scores.mean(axis=1), [cells], 50).interval == (5.0, 5.0)

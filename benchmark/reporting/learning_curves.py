@@ -9,12 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmark.common.canvas import BAND, count_steps, draw_line, draw_seeds, label_below, legend, panels, png, styled
-from benchmark.common.provenance import processors_of_commands
 from benchmark.common.records import Record, entries_by_task
 from benchmark.common.style import styles
 from benchmark.reporting.comparisons import RANDOM
 from benchmark.reporting.estimates import REPETITIONS, bootstrap, interquartile_mean
 from benchmark.reporting.literature import Published, published
+from benchmark.reporting.machines import processors_of_run, processors_of_runs
 from benchmark.reporting.scores import Study, curves, evaluation_grid, failed, floors
 
 # The most curves in one panel; a study of more methods has a panel for each, beside the same reference
@@ -124,14 +124,15 @@ def times_of(study: Study, task: str) -> Times:
     paces = {method: float(np.median(each)) / 60 for method, each in seconds.items()}
     kept = [record for record in measured if record.method in paces]
     elsewhere = [method for method in dict.fromkeys(record.method for record in complete) if method not in paces]
-    return Times(kept, paces, random_steps, _all_processors(study, compared), _all_processors(study, measured), elsewhere)
+    used, known = processors_of_runs(study, compared), processors_of_runs(study, measured)
+    return Times(kept, paces, random_steps, used, known, elsewhere)
 
 
 def _on_one_processor(study: Study, runs: Sequence[Record]) -> Sequence[Record]:
     """Return the runs on the processor that trained the most methods, and the most runs; all runs if none trained two."""
     by_processor: dict[str, list[Record]] = {}
     for run in runs:
-        if len(names := _processors(study, run)) == 1:
+        if len(names := processors_of_run(study, run)) == 1:
             by_processor.setdefault(names[0], []).append(run)
 
     def methods(some: Sequence[Record]) -> int:
@@ -139,15 +140,6 @@ def _on_one_processor(study: Study, runs: Sequence[Record]) -> Sequence[Record]:
 
     most = max((by_processor[name] for name in sorted(by_processor)), key=lambda some: (methods(some), len(some)), default=[])
     return most if methods(most) >= min(2, methods(runs)) else runs
-
-
-def _all_processors(study: Study, runs: Sequence[Record]) -> list[str]:
-    return sorted({name for run in runs for name in _processors(study, run)})
-
-
-def _processors(study: Study, run: Record) -> list[str]:
-    """Return the processors that may have trained a run: those of all commands for a run that does not have its own."""
-    return run.processors or processors_of_commands(study.facts["commands"])
 
 
 def shown_methods(study: Study, task: str) -> list[str]:

@@ -15,6 +15,7 @@ from benchmark.common.tables import markdown_table
 from benchmark.reporting.comparisons import differences_table, improvement_table, subjects_of
 from benchmark.reporting.estimates import FEWEST_RUNS, REPETITIONS, cells_of, estimate, interquartile_mean, number_format
 from benchmark.reporting.literature import literature_section
+from benchmark.reporting.machines import different_processors
 from benchmark.reporting.scores import Study, experiment_number, failed, score_table
 
 # Kinds of errors that are listed for a study
@@ -228,7 +229,7 @@ def comparison_tables(table: pd.DataFrame, study: Study, repetitions: int = REPE
     parts = []
     differences = "" if study.axes else differences_table(table, study.methods)
     if differences:
-        parts += ["**Differences between methods**", differences]
+        parts += ["**Differences between methods**", differences, *different_processors(study)]
     # The paper's method, rather than the light setting
     for subject in subjects_of(study.methods)[-1:]:
         improvement = improvement_table(table, subject, study.methods, repetitions)
