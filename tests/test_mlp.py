@@ -15,6 +15,12 @@ from sb3_cgp.fast.mlp import MANY_ROWS, MLP
 N_INPUTS = 11
 
 
+@pytest.fixture(autouse=True)
+def _elsewhere_than_on_intel(monkeypatch):
+    """On Intel's processors the networks are PyTorch's."""
+    monkeypatch.setattr(products, "is_intel", lambda: False)
+
+
 def modules(net_arch, activation_fn=nn.ReLU, **kwargs):
     th.manual_seed(0)
     return create_mlp(N_INPUTS, 2, net_arch, activation_fn, **kwargs)
@@ -86,12 +92,31 @@ def test_hooks_are_called(kind):
     assert called == [kind]
 
 
-def test_a_second_derivative_is_refused_rather_than_wrong():
-    network = MLP(*copy.deepcopy(NETWORKS["wide"]))
-    inputs = th.randn(MANY_ROWS, N_INPUTS, requires_grad=True)
-    (gradient,) = th.autograd.grad(network(inputs).square().sum(), inputs, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        gradient.sum().backward()
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("rows", [MANY_ROWS - 1, MANY_ROWS])
+def test_second_derivatives_are_those_of_the_sequence(name, rows):
+    """Also where the incoming gradient is constant, as in a gradient penalty."""
+
+    def penalised(network, inputs):
+        inputs = inputs.clone().requires_grad_()
+        outputs = network(inputs)
+        (slopes,) = th.autograd.grad(outputs.sum(), inputs, create_graph=True)
+        (outputs.sin().sum() + slopes.square().sum()).backward()
+        return [slopes, inputs.grad, *(parameter.grad for parameter in network.parameters())]
+
+    network = MLP(*copy.deepcopy(NETWORKS[name])).eval()
+    twin = nn.Sequential(*copy.deepcopy(list(network))).double()
+    inputs = th.randn(rows, N_INPUTS)
+    for ours, theirs in zip(penalised(network, inputs), penalised(twin, inputs.double()), strict=True):
+        th.testing.assert_close(ours.double(), theirs, rtol=1e-4, atol=1e-4)
+
+
+def test_on_intels_processors_the_networks_are_pytorchs(monkeypatch):
+    network, inputs = MLP(*copy.deepcopy(NETWORKS["wide"])), th.randn(256, N_INPUTS)
+    assert "ReLULayers" in network(inputs).grad_fn.name()
+    monkeypatch.setattr(products, "is_intel", lambda: True)
+    assert "ReLULayers" not in network(inputs).grad_fn.name()
+    assert th.equal(network(inputs), nn.Sequential(*network)(inputs))
 
 
 def test_autocast_is_pytorchs():

@@ -8,6 +8,8 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_cgp.fast.processor import is_intel
+
 # Number of multiplications above which oneDNN is faster despite the cost of its call
 MANY_MULTIPLICATIONS = 2**21
 
@@ -19,12 +21,16 @@ def onednn_linear(dtype: th.dtype) -> Callable[..., th.Tensor] | None:
     """
     Return oneDNN's linear layer, a private operator of PyTorch that its compiler uses.
 
-    PyTorch's public linear layer calls MKL for float32, which has half oneDNN's speed on AMD's processors.
+    PyTorch's public linear layer calls MKL for float32, which has half oneDNN's speed on AMD's processors, and is faster on
+    Intel's.
 
     :param dtype: the data type
-    :return: the operator; None if PyTorch has none for this processor, or ``torch.backends.mkldnn`` is disabled
+    :return: the operator; None if PyTorch's linear layer is as fast, if PyTorch has no such operator for this processor, or if
+        ``torch.backends.mkldnn`` is disabled
     """
-    return _probe_onednn_linear(dtype) if th.backends.mkldnn.enabled else None
+    if not th.backends.mkldnn.enabled or (dtype == th.float32 and is_intel()):
+        return None
+    return _probe_onednn_linear(dtype)
 
 
 @functools.cache
