@@ -85,6 +85,16 @@ def test_action_spaces_that_cem_cannot_search_are_refused(action_space):
         make_model(Unsearchable())
 
 
+@pytest.mark.parametrize("name", ["learning_rate", "actor_learning_rate"])
+def test_schedules_are_tried_from_the_beginning_to_the_end(name):
+    with pytest.raises(ValueError, match=rf"`{name}\(0.5\)` is -0.0005, but must be a finite number >= 0"):
+        make_model(**{name: lambda remaining: 1e-3 * (remaining - 1)})
+    with pytest.raises(ValueError, match=rf"`{name}\(0.0\)` is -0.0001, but must be a finite number >= 0"):
+        make_model(**{name: lambda remaining: 1e-3 * (remaining - 0.1)})
+    with pytest.raises(ValueError, match=rf"`{name}` is .* must be a schedule .*; at 0.0 it raises ZeroDivisionError"):
+        make_model(**{name: lambda remaining: 1e-3 / remaining})
+
+
 def test_noise_of_several_environments_is_checked_too():
     noise = VectorizedActionNoise(NormalActionNoise(np.zeros(1), -np.ones(1)), 2)
     with pytest.raises(ValueError, match="`action_noise`"):

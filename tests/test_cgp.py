@@ -1,6 +1,7 @@
 """CGP as a user of SB3 meets it: its defaults, variants, acting, seeding, and its policies."""
 
 import inspect
+import math
 from copy import deepcopy
 
 import numpy as np
@@ -240,6 +241,17 @@ def test_learning_rates_are_separate_and_follow_their_schedules():
     for actor_learning_rate in (None, 1e-3, lambda progress: 1e-3):
         model = make_model(learning_rate=1e-3, actor_learning_rate=actor_learning_rate)
         assert model.actor_lr_schedule(0.5) == 1e-3
+
+
+@pytest.mark.parametrize("rate", [lambda remaining: 2e-3 * remaining, lambda remaining: 2e-3 * math.sqrt(remaining)])
+@pytest.mark.parametrize("name", ["learning_rate", "actor_learning_rate"])
+def test_a_schedule_ends_with_the_planned_steps_even_if_the_last_rollout_goes_on(name, rate):
+    """Beyond them the first would be negative, and the second is not defined."""
+    model = make_model(train_freq=(1, "episode"), gradient_steps=10, **{name: rate})
+    model.learn(250)
+    assert model.num_timesteps == 400
+    optimizer = model.actor.optimizer if name == "actor_learning_rate" else model.critic.optimizer
+    assert optimizer.param_groups[0]["lr"] == 0
 
 
 @pytest.mark.parametrize(("given", "fused"), [(None, True), (dict(weight_decay=0.1), True), (dict(fused=False), False)])

@@ -63,7 +63,8 @@ def check_learning_rate(name: str, value: Any) -> None:
 
     :param name: the argument's name
     :param value: the argument's value
-    :raises ValueError: if the value is not a number >= 0, a schedule of such numbers or a string such as ``"lin_1e-3"``
+    :raises ValueError: if the value is not a number >= 0, a schedule of such numbers from 1.0 to 0.0, or a string such as
+        ``"lin_1e-3"``
     """
     if isinstance(value, str):
         prefix, _, initial_value = value.partition("_")
@@ -73,8 +74,13 @@ def check_learning_rate(name: str, value: Any) -> None:
             is_valid = False
         require(is_valid, name, value, f"a number >= 0, a schedule, or a string such as '{LINEAR_SCHEDULE_PREFIX}1e-3'")
     elif callable(value):
-        for progress_remaining in (1.0, 0.5):
-            rate = value(progress_remaining)
+        # The last gradient step of a training often has no progress remaining
+        for progress_remaining in (1.0, 0.5, 0.0):
+            try:
+                rate = value(progress_remaining)
+            except ArithmeticError as error:
+                allowed = f"a schedule of numbers from 1.0 to 0.0; at {progress_remaining} it raises {error!r}"
+                raise ValueError(f"The value of `{name}` is {value!r}, but must be {allowed}.") from error
             # As SB3 does, which takes an array or a tensor of one number too
             is_single = isinstance(rate, np.ndarray | th.Tensor) and math.prod(rate.shape) == 1
             require_number(f"{name}({progress_remaining})", rate.item() if is_single else rate)

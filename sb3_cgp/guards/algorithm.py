@@ -202,6 +202,11 @@ class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
         fit_replay_buffer(self)
         return result
 
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
+        # The last rollout may end beyond the planned steps, where a schedule such as `2e-3 * remaining` is negative
+        self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
+
 
 class GuardedAlgorithm(CommonGuards, NormalisationGuard):
     """
