@@ -1,5 +1,7 @@
 """Whatever SB3's TD3 can do, CGP can: spaces, environments, buffers, networks and tools of SB3."""
 
+from operator import attrgetter
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -199,7 +201,9 @@ def test_batch_norm_and_dropout_keep_their_modes_and_statistics():
         assert th.equal(model.policy.state_dict()[key], value)
 
 
-@pytest.mark.parametrize("name", ["actor", "critic", "policy"])
+@pytest.mark.parametrize(
+    "name", ["actor", "critic", "policy", "actor.features_extractor", "critic.features_extractor.dropout"]
+)
 def test_predicting_evaluates_whichever_network_was_left_in_training_mode(name):
     model = make_model(policy_kwargs=dict(net_arch=[16], features_extractor_class=NormalisedDropout))
     modules = list(model.policy.actor.modules()) + list(model.policy.critic.modules())
@@ -208,7 +212,15 @@ def test_predicting_evaluates_whichever_network_was_left_in_training_mode(name):
     for _ in range(2):
         model.predict(np.zeros(3, np.float32))
         assert not any(module.training for module in (model.policy, *modules))
-        getattr(model, name).train()
+        attrgetter(name)(model).train()
+
+
+def test_predicting_evaluates_a_features_extractor_that_was_exchanged():
+    model = make_model(policy_kwargs=dict(net_arch=[16], features_extractor_class=NormalisedDropout))
+    observation = np.zeros(3, np.float32)
+    model.predict(observation)
+    model.actor.features_extractor = NormalisedDropout(model.observation_space)
+    assert np.array_equal(model.predict(observation)[0], model.predict(observation)[0])
 
 
 def test_observations_pass_the_features_extractor_once_per_state_never_per_sample():

@@ -1,10 +1,11 @@
 """CGP's policies with the fast networks and the fast scoring."""
 
+from itertools import chain
 from typing import Any
 
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.td3.policies import Actor
 from torch import nn
@@ -96,8 +97,11 @@ class CGPPolicy(policies.CGPPolicy):
 
         :param mode: if true, set to training mode, else set to evaluation mode
         """
-        # SB3 sets the mode at every prediction, which visits every module
-        if not self.training == self.actor.training == self.critic.training == mode:
+        # SB3 sets the mode at every prediction, which visits every module. The user may have trained or exchanged a features
+        # extractor; the other modules, and flattening, have no modes that differ.
+        extractors = [network.features_extractor for network in (self.actor, self.critic)]
+        visited = [each.modules() for each in extractors if type(each) is not FlattenExtractor]
+        if any(module.training != mode for module in chain((self, self.actor, self.critic), *visited)):
             super().set_training_mode(mode)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
