@@ -96,8 +96,8 @@ class CGP(
         None trains no actor, so that CEM acts at inference too
     :param policy_training: "online" trains the actor along with the critics, "offline" at the end of ``learn``
         (see :meth:`train_policy`)
-    :param inference: what ``predict`` uses: the "actor", the "averaged_actor" (φ' of Algorithm 2) or "cem".
-        None stands for the actor, or for CEM where there is no ``policy_loss``. Rollouts always use CEM, and so does
+    :param inference: what ``predict`` uses: the "actor", the "averaged_actor" (φ' of Algorithm 2) or "cem", the policy's
+        selector. None stands for the actor, or for CEM where there is no ``policy_loss``. Rollouts always use CEM, and so does
         ``predict`` while the policy waits for its offline training, in a second ``learn`` too.
     :param actor_learning_rate: learning rate of the actor, in the same forms. None stands for ``learning_rate``.
     :param policy_delay: The actor is updated once every ``policy_delay`` gradient steps
@@ -322,8 +322,8 @@ class CGP(
     @classmethod
     def _check_saved(cls, saved: Mapping[str, Any]) -> None:
         allowed = f"of {cls.__name__}, a single agent: load a population by `sb3_cgp.population.Population.load(path)`"
-        # An attribute `agents` may be the user's
-        require("_agent_updates" not in saved, "path", "a file with the attribute `agents`", allowed)
+        # A user's own subclass may have an attribute `agents`
+        require("_agent_updates" not in saved, "path", "the file of a population", allowed)
 
     def set_parameters(
         self, load_path_or_dict: str | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"

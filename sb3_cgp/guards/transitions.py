@@ -153,7 +153,7 @@ class BoundsWatch:
         warnings.warn(
             f"The environment returned an {name} outside of its observation space at environment step {timestep}: value "
             f"{values[first]} at index {index}, where the bounds are [{box.low[index]}, {box.high[index]}]. Training goes on, "
-            "as nothing in CGP depends on these bounds. This is said once.",
+            "as nothing in the algorithm depends on these bounds. This is said once.",
             stacklevel=2,
         )
 

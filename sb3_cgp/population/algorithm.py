@@ -259,7 +259,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
     @classmethod
     def _check_saved(cls, saved: Mapping[str, Any]) -> None:
         allowed = f"of {cls.__name__}, a population: load a single agent by its own class, such as `CGP.load(path)`"
-        require(not saved or "_agent_updates" in saved, "path", "a file without the attribute `agents`", allowed)
+        require(not saved or "_agent_updates" in saved, "path", "the file of a single agent", allowed)
 
     @classmethod
     def _make_env(cls, env: Any, saved: Any) -> Any:
