@@ -320,16 +320,29 @@ def test_few_seeds_decide_nothing(find: Any, seeds: int) -> None:
     assert "no interval" in found.text
 
 
-def test_the_page_of_a_users_own_sweep_has_no_claims_without_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The record of ``benchmark.runtime``, which is this repository's, is no data of the user's."""
-    mine = write_study(tmp_path / "mine", runs(scores(PPO=50, A2C=40), ["PPO", "A2C"]))
-    text = figures([mine], tmp_path, 10).read_text()
-    assert f"Drawing the figures of mine into {tmp_path}/figures" in capsys.readouterr().err
-    own = text[text.index("## The paper's claims") : text.index("## How to read this page")].splitlines()
-    sentence = "None of the paper's experiments is on this page, and its runs have no data on the paper's claims."
-    assert own == ["## The paper's claims", "", sentence, ""]
-    assert "Figure numbers in headings are the paper's" not in text
-    assert "benchmark.runtime" not in text
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("name", ["mine", "experiment-1", "e10", "e10-mine"])
+def test_only_the_papers_experiments_are_judged(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Neither a user's own study nor E10 changes a verdict on a page with the paper's, and alone they have none."""
+    methods = ["CGP-Online", "CEM", "TD3", "SAC"]
+    papers = write_study(tmp_path / "e1", runs(scores(CGP_Online=80, CEM=50, TD3=40, SAC=30), methods))
+    opposite = runs(scores(CGP_Online=0, CEM=900, TD3=800, SAC=700), methods)
+    other = write_study(tmp_path / name, [replace(run, experiment=name) for run in opposite])
+
+    def page(*folders: Path) -> str:
+        return figures(folders, tmp_path, 50).read_text()
+
+    def claims(text: str) -> str:
+        return text[text.index("## The paper's claims") : text.index("## Findings by task")]
+
+    alone = page(papers)
+    assert "supported" in claims(alone)
+    assert claims(page(papers, other)) == claims(alone)
+    assert f"Drawing the figures of e1, {name} into {tmp_path}/figures" in capsys.readouterr().err
+    text = page(other)
+    for part in ("claims", "Figure numbers in headings are the paper's", "benchmark.runtime"):
+        assert part in alone
+        assert part not in text
 
 
 def test_the_time_of_inference_is_that_measured_beside_the_page(tmp_path: Path) -> None:
@@ -347,17 +360,3 @@ def test_the_time_of_inference_is_that_measured_beside_the_page(tmp_path: Path) 
     (tmp_path / "runtime").mkdir()
     (tmp_path / "runtime/runtime.json").write_text(json.dumps(record))
     assert "takes 1.00 (1.00 to 1.00) times as long" in claim()
-
-
-def test_the_page_of_a_users_own_sweep_has_the_claims_on_which_it_has_data(tmp_path: Path) -> None:
-    levels = scores(CGP_Online=50, CEM=20)
-    mine = write_study(tmp_path / "mine", runs(levels, ["CGP-Online", "CEM"]))
-    text = unpadded(figures([mine], tmp_path, 10).read_text())
-    assert "None of the paper's experiments is on this page. The table lists the claims on which these runs" in text
-    assert "| the actor is at least as good as the CEM policy that it imitates |" in text
-    assert NO_DATA not in text
-    papers = write_study(tmp_path / "e1", runs(levels, ["CGP-Online", "CEM"]))
-    text = figures([mine, papers], tmp_path, 10).read_text()
-    assert "None of the paper's experiments is on this page" not in text
-    assert NO_DATA in text
-    assert "Figure numbers in headings are the paper's" in text

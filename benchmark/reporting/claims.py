@@ -27,8 +27,6 @@ FAMILY = ("CGP-Online", "CGP-Offline", "QGP-Online", "QGP-Offline")
 IMITATED = "CEM"
 # The beginnings of the names of CGP's variants, which are no rivals of it
 VARIANTS = ("CGP", "QGP")
-# Experiments of this project, on tasks that the paper's claims are not about
-NOT_THE_PAPERS = (10,)
 BASELINES = ("TD3", "SAC", "DDPG")
 # Of the actor's inference time, with more CEM iterations to that with fewer
 COST_MARGIN = 0.1
@@ -46,8 +44,8 @@ variant is *lower* than others by more than this; *independent* allows {COST_MAR
 {FAILURE:g} of the range against the best of the other values, chosen by these data, where all else is equal. "Best or second
 best" is among {OURS} and all methods but its variants, {IMITATED} and {RANDOM}, in studies that vary no hyperparameter, on
 each task by itself: *{SUPPORTED}* if {OURS} is higher than all rivals but one, *{CONTRADICTED}* if it is lower than two, by
-the intervals of the tables of differences; a task with fewer than {FEWEST_RUNS} runs of one of them has *{TOO_FEW}*. E10,
-whose tasks are not the paper's, does not count for any claim."""
+the intervals of the tables of differences; a task with fewer than {FEWEST_RUNS} runs of one of them has *{TOO_FEW}*. Only
+this project's experiments count, as their files' names say, and E10 does not, as its tasks are not the paper's."""
 
 
 def findings(table: pd.DataFrame, runtime: dict[str, Any] | None, repetitions: int = REPETITIONS) -> list[Finding]:

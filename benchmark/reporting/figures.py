@@ -11,7 +11,7 @@ from typing import Any
 
 from benchmark.common.files import read_json
 from benchmark.common.records import RUNS
-from benchmark.reporting.claims import NOT_THE_PAPERS, findings
+from benchmark.reporting.claims import findings
 from benchmark.reporting.commands import FIGURES_ONLY, FOLDER, command_line, with_results_folder
 from benchmark.reporting.comparisons import experiments_section
 from benchmark.reporting.drawing import final_rewards, sensitivity, stability, values
@@ -101,11 +101,11 @@ def page_of(
     :param repetitions: number of bootstrap samples
     :return: the page, in Markdown
     """
-    papers = [study for study in in_earnest if experiment_number(study) not in NOT_THE_PAPERS]
-    of_the_user = all(experiment_number(study) is None for study in studies)
-    runtime = None if of_the_user else read_runtime(out)
-    judged = findings(score_table(papers), runtime, repetitions)
-    claims = claims_section(judged, of_the_user)
+    with_claims = any(is_papers(study) for study in studies)
+    claims = []
+    if with_claims:
+        judged = score_table([study for study in in_earnest if is_papers(study)])
+        claims = [claims_section(findings(judged, read_runtime(out), repetitions))]
     folders = [study.folder for study in studies]
     command = command_line([] if folders == study_folders(out) else folders, out, repetitions)
     found = [
@@ -119,22 +119,18 @@ def page_of(
         # A study's figures depend on nothing else
         drawing = f"{command_line([study.folder], out, repetitions)} {FIGURES_ONLY}"
         results += study_sections(with_results_folder(study, out), own, drawing, out, repetitions)
-    if any(is_papers(study) for study in studies):
-        sections = [introduction(studies), claims, *found, *pooled, *results]
-    else:
-        # The findings on these studies come first, and the paper's claims last
-        sections = [introduction(studies), *found, *results, claims, *pooled]
-    return page(list(filter(None, sections)), command, not of_the_user or any(finding.parts for finding in judged))
+    sections = [introduction(studies), *claims, *found, *pooled, *results]
+    return page(list(filter(None, sections)), command, with_claims)
 
 
 def is_papers(study: Study) -> bool:
     """
-    Return whether a study is one of the paper's experiments.
+    Return whether a study is one of the paper's experiments, whose runs its claims are judged by.
 
     :param study: the study
-    :return: whether it is of E1 to E8, whatever its tasks and lengths
+    :return: whether it has one of this project's names, whatever its tasks and lengths, but E10's, whose tasks are others
     """
-    return experiment_number(study) not in (None, *NOT_THE_PAPERS)
+    return experiment_number(study) not in (None, 10)
 
 
 def read_runtime(out: Path) -> dict[str, Any] | None:

@@ -26,8 +26,7 @@ Numbers that seem to contradict each other:
   is the policy's.
 - The interquartile mean of the final returns is not their mean: it leaves out the lowest and the highest quarter of the runs.
   Of four runs it is the mean of the middle two, so that one run that failed changes the mean and the interval alone. Tables
-  of final returns have both; differences between methods are differences of means, those of the claims on imitation and on
-  offline training of interquartile means.
+  of final returns have both; differences between methods are differences of means{{means}}.
 - The same method, task and number of steps can have other numbers in other studies and on other pages: hyperparameters, the
   number of random steps at the start and the networks differ. Each study's section lists its own.
 
@@ -51,17 +50,12 @@ SHARES = (
 
 # What the page adds where it judges the paper's claims
 WITH_CLAIMS = {
-    "claims": "; the claims use those of all studies here but E10's",
+    "means": ", those of the claims on imitation and on\n  offline training of interquartile means",
+    "claims": "; the claims use those of all studies of the paper's experiments here",
     "papers": "\nThe time of inference is measured separately, by `python -m benchmark.runtime`. "
     "Figure numbers in headings are the paper's.",
 }
-WITHOUT_CLAIMS = {"claims": "", "papers": ""}
 CLAIMS = "## The paper's claims"
-NO_DATA_OF_THE_USER = "None of the paper's experiments is on this page, and its runs have no data on the paper's claims."
-OF_THE_USER = (
-    "None of the paper's experiments is on this page. The table lists the claims on which these runs, which were not made for "
-    "them, have data."
-)
 
 
 def introduction(studies: Sequence[Study]) -> str:
@@ -80,18 +74,13 @@ def introduction(studies: Sequence[Study]) -> str:
     return text
 
 
-def claims_section(findings: Sequence[Finding], of_the_user: bool = False) -> str:
+def claims_section(findings: Sequence[Finding]) -> str:
     """
     Report on the paper's claims.
 
     :param findings: the findings on the claims
-    :param of_the_user: whether none of this project's experiments is on the page. Claims without data are then left out.
     :return: the section, in Markdown
     """
-    if of_the_user:
-        findings = [finding for finding in findings if finding.parts]
-        if not findings:
-            return f"{CLAIMS}\n\n{NO_DATA_OF_THE_USER}"
     rows = [[finding.claim, finding.evidence or "-", f"**{finding.verdict}**"] for finding in findings]
     table = markdown_table(["claim", "evidence (95 % interval)", "verdict"], rows, align="left")
     several = [finding for finding in findings if len(finding.parts) > 1 or any(part.note for part in finding.parts)]
@@ -100,7 +89,7 @@ def claims_section(findings: Sequence[Finding], of_the_user: bool = False) -> st
         for finding in several
     ]
     folds = [fold("All comparisons", *parts)] * bool(parts) + [fold("How claims are judged", RULES)]
-    return "\n\n".join([CLAIMS, *[OF_THE_USER] * of_the_user, table, SHARES, *folds])
+    return "\n\n".join([CLAIMS, table, SHARES, *folds])
 
 
 def pooled_section(picture: Picture, command: str) -> str:
@@ -114,14 +103,14 @@ def pooled_section(picture: Picture, command: str) -> str:
     return f"## All sweeps together\n\n{picture.in_words()}\n\n{fold('Command', f'`{command}`')}"
 
 
-def page(sections: Sequence[str], command: str, with_claims: bool = True) -> str:
+def page(sections: Sequence[str], command: str, with_claims: bool) -> str:
     """
     Return the page.
 
     :param sections: its sections
     :param command: the command that writes it
-    :param with_claims: whether one of the sections has data on the paper's claims
+    :param with_claims: whether one of the sections judges the paper's claims
     :return: the page, in Markdown
     """
-    reading = READING.format(**(WITH_CLAIMS if with_claims else WITHOUT_CLAIMS))
+    reading = READING.format(**(WITH_CLAIMS if with_claims else dict.fromkeys(WITH_CLAIMS, "")))
     return "\n\n".join([TITLE, *sections, reading, fold("The command that writes this page", f"`{command}`")]) + "\n"
