@@ -60,7 +60,7 @@ def open_ledger(args: argparse.Namespace) -> Ledger:
     """
     check_grace(args.beat, args.grace)
     storage = patiently(open_storage, args.storage, create=False)
-    names = patiently(optuna.get_all_study_names, storage)
+    names = optuna.get_all_study_names(storage)
     allowed = f"a study that benchmark.sweep has begun in this storage, which holds {', '.join(names) or 'none'}"
     require(args.study in names, "study", args.study, allowed)
     ledger = Ledger(storage, args.study, args.grace)

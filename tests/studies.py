@@ -128,7 +128,7 @@ class Line:
 
 def work_through(storage, sweep, clock, logs, population=1):
     """Do what a process of a sweep does."""
-    ledger = Ledger(storage, "study", GRACE, clock)
+    ledger = Ledger(storages.patient(storage), "study", GRACE, clock)
     ledger.open(sweep, {"experiment": sweep.name})
     worker.execute_runs(ledger, logs, "a process", population=population)
 

@@ -1,14 +1,17 @@
 """Configurations that a process has left, or that several processes take."""
 
 import time
+from itertools import count
 
 import pytest
 from optuna.storages import InMemoryStorage
 from optuna.trial import TrialState
+from studies import Heart, Line
 from tunings import arguments, samples, tuner_of
 
 from benchmark import tune
 from benchmark.sweeps import tuner
+from benchmark.sweeps.storages import patient
 from benchmark.sweeps.study_trials import ERROR, LOST
 from benchmark.sweeps.tuning import ORIGIN, SCORES
 from benchmark.sweeps.validation import SweepError
@@ -126,6 +129,42 @@ def test_a_process_that_was_given_up_leaves_the_trial_alone(work, pretend, tmp_p
     tuner.attempt(tmp_path, 5.0, None, "cpu")
     assert [trial.state for trial in tuner.trials()] == [TrialState.FAIL, TrialState.WAITING]
     assert ERROR not in tuner.trials()[0].user_attrs
+
+
+@pytest.mark.usefixtures("clock")
+@pytest.mark.parametrize("waits", [False, True])
+@pytest.mark.parametrize("takes_effect", [False, True])
+def test_a_call_that_the_database_does_not_answer_is_repeated_alone(
+    pretend, tmp_path, monkeypatch, capsys, waits, takes_effect
+):
+    """
+    It is one after another of all calls of an attempt, those of Optuna's ``ask`` included.
+
+    A trial is left to be found silent only where it was made or taken, and the answer was lost.
+    """
+    monkeypatch.setattr(tuner, "HeartbeatThread", Heart)
+    pretend(lambda run: 1.0)
+    args = tune.parse(arguments("--logs", str(tmp_path)))
+    left_behind = 0
+    for calls in count():
+        faults = []
+        line = Line(InMemoryStorage(), lambda faults=faults: faults.pop(0) if faults else None)
+        own = tuner_of(args, patient(line))
+        if waits:
+            own._study.enqueue_trial({"one_minus_gamma": 0.01})
+        faults += [None] * calls + [(ConnectionError, takes_effect)]
+        own.attempt(tmp_path / str(calls), 5.0, None, "cpu")
+        *others, last = own.trials()
+        assert (last.state, last.value) == (TrialState.COMPLETE, 1.0)
+        assert [(trial.state, trial.params) for trial in others] in ([], [(TrialState.RUNNING, {})])
+        left_behind += len(others)
+        if faults:
+            break
+    assert calls > 20
+    assert left_behind == takes_effect
+    printed = capsys.readouterr()
+    assert "was given to another process" not in printed.out
+    assert printed.err.count("The storage does not answer (ConnectionError)") == calls
 
 
 def test_a_study_is_not_opened_with_other_settings(work, pretend):

@@ -13,7 +13,6 @@ from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState
 
 from benchmark.sweeps.signals import end_if_asked
-from benchmark.sweeps.storages import patiently
 
 # Defaults: seconds between two heartbeats, and seconds of silence after which a process is taken for lost
 BEAT, GRACE = 5.0, 60.0
@@ -58,7 +57,7 @@ def send_beat(
     """
     progress = {"beat": count, "step": step, "seconds": round(seconds, 1), "processor_seconds": round(processor_seconds, 1)}
     with noticing_loss(f"trial {trial_id}"):
-        patiently(storage.set_trial_user_attr, trial_id, PROGRESS, progress)
+        storage.set_trial_user_attr(trial_id, PROGRESS, progress)
 
 
 class HeartbeatThread:

@@ -8,8 +8,6 @@ from optuna.pruners import BasePruner, NopPruner, WilcoxonPruner
 from optuna.trial import FrozenTrial, TrialState
 from scipy.stats import trim_mean
 
-from benchmark.sweeps.storages import patiently
-
 # Number of complete trials before the first trial is pruned
 N_STARTUP_TRIALS = 5
 SCORING: dict[str, Callable[[Sequence[float]], float]] = {
@@ -36,7 +34,7 @@ class ScorePruner(BasePruner):
         :return: whether the trial is given up
         """
         step = trial.last_step
-        complete = patiently(study.get_trials, deepcopy=False, states=(TrialState.COMPLETE,))
+        complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
         others = [each.intermediate_values[step] for each in complete if step in each.intermediate_values]
         if step is None or len(others) < N_STARTUP_TRIALS:
             return False

@@ -4,8 +4,9 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 from urllib.parse import urlsplit
 
 import grpc
@@ -41,7 +42,7 @@ def open_storage(url: str, create: bool = True) -> BaseStorage:
 
     :param url: SQLAlchemy's URL of a database, or ``grpc://host:port`` of Optuna's proxy in front of one
     :param create: whether a missing file is created; if not, it is refused
-    :return: the storage
+    :return: the storage, with the patience of :func:`patient`
     :raises ValueError: if it is neither, the database's driver is not installed, the database is in memory, or its file is
         missing and not to be created
     :raises StorageError: if the database does not answer
@@ -52,10 +53,10 @@ def open_storage(url: str, create: bool = True) -> BaseStorage:
             raise ValueError(
                 f"The value of `storage` is {without_password(url)!r}, but must have a host and a port, as in grpc://localhost:13000"
             )
-        return GrpcStorageProxy(host=parts.hostname, port=parts.port)
+        return patient(GrpcStorageProxy(host=parts.hostname, port=parts.port))
     database = _read_url(url)
     if database.get_backend_name() != "sqlite":
-        return get_storage(_open_database(database, {"pool_pre_ping": True}))
+        return patient(get_storage(_open_database(database, {"pool_pre_ping": True})))
     # SQLite's own URLs of files are left to it
     path = Path(database.database or "")
     if not create and not path.exists() and "uri" not in database.query:
@@ -63,7 +64,7 @@ def open_storage(url: str, create: bool = True) -> BaseStorage:
             f"The value of `storage` is {without_password(url)!r}, but there is no file {path}: give the --storage of the "
             "command that has begun the study, from the same folder"
         )
-    return get_storage(_open_sqlite(database))
+    return patient(get_storage(_open_sqlite(database)))
 
 
 def without_password(url: str) -> str:
@@ -208,3 +209,26 @@ def patiently(call: Callable[..., Result], *args: Any, patience: float = 300.0, 
                 is_told = True
             time.sleep(pause)
             pause = min(2 * pause, 5.0)
+
+
+def patient(storage: BaseStorage) -> BaseStorage:
+    """
+    Let each call of a storage be repeated by :func:`patiently`, those that Optuna makes included.
+
+    Repeating a method of Optuna's study, which makes several calls, would leave what its first calls have done: ``ask`` would
+    take two trials. What a storage has done although its answer was lost is still done twice: of two equal trials, the
+    studies here use one, and a trial that was taken and is unknown to its process is lost after the grace period.
+
+    :param storage: the storage
+    :return: an object with the storage's methods. Optuna asks for a storage's class only to wrap an ``RDBStorage``, as
+        ``get_storage`` does, and for Optuna's own heartbeat, which is not used here.
+    """
+    return cast(BaseStorage, _Patient(storage))
+
+
+class _Patient:
+    def __init__(self, storage: BaseStorage):
+        self._storage = storage
+
+    def __getattr__(self, name: str) -> Any:
+        return partial(patiently, getattr(self._storage, name))

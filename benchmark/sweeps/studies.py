@@ -33,7 +33,6 @@ from benchmark.common.records import Record
 from benchmark.sweeps.experiments import Sweep, difference
 from benchmark.sweeps.heartbeats import PROGRESS, SilenceDetector, TrialLostError
 from benchmark.sweeps.runs import Run
-from benchmark.sweeps.storages import patiently
 from benchmark.sweeps.study_trials import (
     COMMAND,
     ERROR,
@@ -83,11 +82,11 @@ class Ledger(TrialWriter):
         :raises SweepError: if the study exists with other settings, or with the trials of a tuning
         """
         try:
-            self._study_id = patiently(self.storage.create_new_study, [StudyDirection.MAXIMIZE], self.name)
+            self._study_id = self.storage.create_new_study([StudyDirection.MAXIMIZE], self.name)
         except DuplicatedStudyError:
             self._study_id = None
         runs, trials = sweep.runs(), self.trials()
-        attributes = patiently(self.storage.get_study_user_attrs, self.study_id)
+        attributes = self.storage.get_study_user_attrs(self.study_id)
         if TUNING in attributes:
             raise self._refusal("", "holds the trials of a tuning")
         self.refuse_unresolved()
@@ -98,7 +97,7 @@ class Ledger(TrialWriter):
             raise self._refusal(*found)
         commands = description.get("commands", [])
         facts = {key: value for key, value in description.items() if key != "commands"}
-        patiently(self.storage.set_study_user_attr, self.study_id, SWEEP, facts)
+        self.storage.set_study_user_attr(self.study_id, SWEEP, facts)
         self.adopt(ended, runs)
         self.enqueue_missing(runs)
         self._record_commands(commands)
@@ -144,14 +143,14 @@ class Ledger(TrialWriter):
             # A command that begins now has nothing to train; those of adopted runs have that number already
             commands = [command for command in commands if "runs_ended" in command]
         n_ended = sum(trial.state.is_finished() for trial in owned(self.trials()).values())
-        present = patiently(self.storage.get_study_user_attrs, self.study_id)
+        present = self.storage.get_study_user_attrs(self.study_id)
         for command in commands:
             # A command that is started again is the same, whatever the machine's load
             same = json.dumps({**command, "load_average": None, "runs_ended": None}, sort_keys=True)
             digest = hashlib.sha256(same.encode()).hexdigest()[:16]
             if not any(name.startswith(COMMAND) and name.endswith(digest) for name in present):
                 name, value = f"{COMMAND}{time.time_ns()} {digest}", {"runs_ended": n_ended, **command}
-                patiently(self.storage.set_study_user_attr, self.study_id, name, value)
+                self.storage.set_study_user_attr(self.study_id, name, value)
 
     def enqueue_missing(self, runs: Iterable[Run], trials: Sequence[FrozenTrial] | None = None) -> None:
         """
@@ -172,7 +171,7 @@ class Ledger(TrialWriter):
                     distributions=distributions,
                     user_attrs=attributes_of(run),
                 )
-                patiently(self.storage.create_new_trial, self.study_id, trial)
+                self.storage.create_new_trial(self.study_id, trial)
 
     def adopt(self, records: Iterable[Record], runs: Sequence[Run]) -> None:
         """
@@ -200,7 +199,7 @@ class Ledger(TrialWriter):
                 user_attrs=attributes_of(run) | progress | population | error | processors,
                 intermediate_values=dict(zip(record.timesteps, record.returns, strict=True)),
             )
-            patiently(self.storage.create_new_trial, self.study_id, trial)
+            self.storage.create_new_trial(self.study_id, trial)
             # A trial that waits remains the run's own until it ends, and so does one that a process takes first
             if owner is not None and self._take(owner_id := self._id(owner)):
                 self._end(owner_id, TrialState.FAIL, outcome="given up: the run was adopted")

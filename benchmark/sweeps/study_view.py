@@ -8,7 +8,6 @@ from optuna.trial import FrozenTrial
 
 from benchmark.common.records import Record
 from benchmark.sweeps.runs import Run, overview
-from benchmark.sweeps.storages import patiently
 from benchmark.sweeps.study_trials import COMMAND, KEY, RUN, SWEEP, choices_of, owned, record_of
 
 
@@ -33,7 +32,7 @@ class StudyView:
         :raises KeyError: if the storage holds no study of the name
         """
         if self._study_id is None:
-            self._study_id = patiently(self.storage.get_study_id_from_name, self.name)
+            self._study_id = self.storage.get_study_id_from_name(self.name)
         return self._study_id
 
     def trials(self) -> list[FrozenTrial]:
@@ -42,7 +41,7 @@ class StudyView:
 
         :return: the trials, in their order
         """
-        trials = patiently(self.storage.get_all_trials, self.study_id, deepcopy=False)
+        trials = self.storage.get_all_trials(self.study_id, deepcopy=False)
         return [trial for trial in trials if KEY in trial.user_attrs]
 
     def description(self) -> dict[str, Any]:
@@ -52,7 +51,7 @@ class StudyView:
         :return: the description that :meth:`~benchmark.sweeps.studies.Ledger.open` was given, with all runs that the study was
             ever given, and all commands
         """
-        attributes = patiently(self.storage.get_study_user_attrs, self.study_id)
+        attributes = self.storage.get_study_user_attrs(self.study_id)
         noted = [(value["runs_ended"], name) for name, value in attributes.items() if name.startswith(COMMAND)]
         commands = [attributes[name] for _, name in sorted(noted)]
         trials = self.trials()

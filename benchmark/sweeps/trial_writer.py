@@ -7,7 +7,6 @@ from optuna.trial import FrozenTrial, TrialState
 
 from benchmark.sweeps.attempts import fruitless, in_words
 from benchmark.sweeps.heartbeats import PROGRESS, TrialLostError, noticing_loss, send_beat
-from benchmark.sweeps.storages import patiently
 from benchmark.sweeps.study_trials import CONTINUED, ERROR, KEY, OUTCOME, Claim
 from benchmark.sweeps.study_view import StudyView
 
@@ -22,7 +21,7 @@ class TrialWriter(StudyView):
 
     def _take(self, trial_id: int) -> bool:
         try:
-            return patiently(self.storage.set_trial_state_values, trial_id, TrialState.RUNNING)
+            return self.storage.set_trial_state_values(trial_id, TrialState.RUNNING)
         except UpdateFinishedTrialError:
             return False
 
@@ -49,7 +48,7 @@ class TrialWriter(StudyView):
         :raises TrialLostError: if another process has ended the trial
         """
         with noticing_loss(claim.run.key):
-            patiently(self.storage.set_trial_user_attr, claim.trial_id, name, value)
+            self.storage.set_trial_user_attr(claim.trial_id, name, value)
 
     def report(self, claim: Claim, step: int, value: float) -> None:
         """
@@ -61,7 +60,7 @@ class TrialWriter(StudyView):
         :raises TrialLostError: if another process has ended the trial
         """
         with noticing_loss(claim.run.key):
-            patiently(self.storage.set_trial_intermediate_value, claim.trial_id, step, value)
+            self.storage.set_trial_intermediate_value(claim.trial_id, step, value)
 
     def complete(self, claim: Claim, value: float) -> None:
         """
@@ -73,7 +72,7 @@ class TrialWriter(StudyView):
         """
         self._end(claim.trial_id, TrialState.COMPLETE, value=value)
         # This process may have ended it itself, before the answer of its database was lost
-        if patiently(self.storage.get_trial, claim.trial_id).state is not TrialState.COMPLETE:
+        if self.storage.get_trial(claim.trial_id).state is not TrialState.COMPLETE:
             raise TrialLostError(claim.run.key)
 
     def holds(self, claim: Claim) -> bool:
@@ -83,7 +82,7 @@ class TrialWriter(StudyView):
         :param claim: the run
         :return: whether no process has ended its trial
         """
-        return not patiently(self.storage.get_trial, claim.trial_id).state.is_finished()
+        return not self.storage.get_trial(claim.trial_id).state.is_finished()
 
     def fruitless(self, claim: Claim) -> int:
         """
@@ -121,11 +120,11 @@ class TrialWriter(StudyView):
     def _end(self, trial_id: int, state: TrialState, outcome: str | None = None, value: float | None = None) -> None:
         try:
             if outcome is not None:
-                patiently(self.storage.set_trial_user_attr, trial_id, OUTCOME, outcome)
-            patiently(self.storage.set_trial_state_values, trial_id, state, None if value is None else [value])
+                self.storage.set_trial_user_attr(trial_id, OUTCOME, outcome)
+            self.storage.set_trial_state_values(trial_id, state, None if value is None else [value])
         except UpdateFinishedTrialError:
             # Another process has ended it, or this one before the answer of its database was lost
             pass
 
     def _id(self, trial: FrozenTrial) -> int:
-        return patiently(self.storage.get_trial_id_from_study_id_trial_number, self.study_id, trial.number)
+        return self.storage.get_trial_id_from_study_id_trial_number(self.study_id, trial.number)

@@ -8,6 +8,7 @@ unfinished seed continues from its last state.
 import time
 import traceback
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -23,7 +24,6 @@ from benchmark.sweeps.locks import locked
 from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, run_folder, train
 from benchmark.sweeps.scoring import PRUNERS, SCORING
 from benchmark.sweeps.signals import undisturbed
-from benchmark.sweeps.storages import patiently
 from benchmark.sweeps.study_trials import ERROR, LOST, OUTCOME, STOPPED, SWEEP, TUNING
 from benchmark.sweeps.tuning import ORIGIN, SCORES, Tuning
 from benchmark.sweeps.validation import SweepError
@@ -42,8 +42,7 @@ class Tuner:
     def __init__(self, storage: BaseStorage, name: str, tuning: Tuning, grace: float):
         self._storage, self._tuning = storage, tuning
         self._silence = SilenceDetector(grace)
-        self._study = patiently(
-            optuna.create_study,
+        self._study = optuna.create_study(
             storage=storage,
             study_name=name,
             direction="maximize",
@@ -52,18 +51,18 @@ class Tuner:
             sampler=TPESampler(multivariate=True, constant_liar=True),
             pruner=PRUNERS[tuning.pruner](),
         )
-        self._study_id = patiently(storage.get_study_id_from_name, name)
+        self._study_id = storage.get_study_id_from_name(name)
         self._check()
 
     def _check(self) -> None:
         now = asdict(self._tuning)
-        attributes = patiently(lambda: self._study.user_attrs)
+        attributes = self._study.user_attrs
         was = attributes.get(TUNING)
         if was is None:
             if SWEEP in attributes or self.trials():
                 problem = "holds the trials of a sweep, or of another program. Choose another name by --study"
                 raise SweepError(f"The study {self._study.study_name!r}", "", problem)
-            patiently(self._study.set_user_attr, TUNING, now)
+            self._study.set_user_attr(TUNING, now)
         elif was != now:
             key = next(key for key in now if was.get(key) != now[key])
             problem = f"was {was.get(key)!r} and is now {now[key]!r}. Choose another name by --study"
@@ -75,7 +74,7 @@ class Tuner:
 
         :return: the trials
         """
-        return patiently(self._study.get_trials, deepcopy=False)
+        return self._study.get_trials(deepcopy=False)
 
     def recover(self) -> None:
         """
@@ -90,17 +89,17 @@ class Tuner:
         trial_id = self._id(number)
         try:
             if outcome != STOPPED and fruitless(self._attempts(number)) >= MOST:
-                patiently(self._storage.set_trial_user_attr, trial_id, ERROR, outcome.removeprefix(SUSPECT))
-            patiently(self._storage.set_trial_user_attr, trial_id, OUTCOME, outcome)
-            patiently(self._storage.set_trial_state_values, trial_id, TrialState.FAIL)
+                self._storage.set_trial_user_attr(trial_id, ERROR, outcome.removeprefix(SUSPECT))
+            self._storage.set_trial_user_attr(trial_id, OUTCOME, outcome)
+            self._storage.set_trial_state_values(trial_id, TrialState.FAIL)
         except UpdateFinishedTrialError:
             return
-        trial = patiently(self._storage.get_trial, trial_id)
+        trial = self._storage.get_trial(trial_id)
         # Some parameters of an enqueued configuration may not have been suggested again yet
         params = {**trial.system_attrs.get("fixed_params", {}), **trial.params}
         if params and ERROR not in trial.user_attrs:
             attributes = {ORIGIN: trial.user_attrs.get(ORIGIN, trial.number), SCORES: trial.user_attrs.get(SCORES, [])}
-            patiently(self._study.enqueue_trial, params, attributes)
+            self._study.enqueue_trial(params, attributes)
 
     def _attempts(self, number: int) -> list[FrozenTrial]:
         """List the trials of a trial's configuration."""
@@ -109,7 +108,7 @@ class Tuner:
         return [trial for trial in trials if trial.user_attrs.get(ORIGIN, trial.number) == origin]
 
     def _id(self, number: int) -> int:
-        return patiently(self._storage.get_trial_id_from_study_id_trial_number, self._study_id, number)
+        return self._storage.get_trial_id_from_study_id_trial_number(self._study_id, number)
 
     def attempt(self, logs: Path, interval: float, parent: int | None, device: str) -> None:
         """
@@ -120,7 +119,7 @@ class Tuner:
         :param parent: the process that started this one
         :param device: device of the networks
         """
-        trial = patiently(self._study.ask)
+        trial = self._study.ask()
         trial_id = self._id(trial.number)
 
         def beat(count: str, step: int, *seconds: float) -> None:
@@ -128,11 +127,13 @@ class Tuner:
 
         try:
             with HeartbeatThread(beat, interval, parent) as heartbeat:
-                patiently(self._tuning.sample, trial)
+                self._tuning.sample(trial)
                 scores = self._scores(trial, trial_id, logs, heartbeat, device)
             value = None if scores is None else SCORING[self._tuning.score](scores)
             state = TrialState.PRUNED if value is None else TrialState.COMPLETE
-            patiently(self._study.tell, trial, value, state, skip_if_finished=True)
+            with suppress(UpdateFinishedTrialError):
+                # Another process has ended it, or this one before the answer of its database was lost
+                self._study.tell(trial, value, state, skip_if_finished=True)
         except (TrialLostError, UpdateFinishedTrialError):
             print(f"Trial {trial.number} was given to another process", flush=True)
         except MACHINE_ERRORS as error:
@@ -151,7 +152,7 @@ class Tuner:
         self, trial: optuna.Trial, trial_id: int, logs: Path, heartbeat: HeartbeatThread, device: str
     ) -> list[float] | None:
         """Train a configuration with one seed after another; None if it is pruned."""
-        frozen = patiently(self._storage.get_trial, trial_id)
+        frozen = self._storage.get_trial(trial_id)
         scores = list(frozen.user_attrs.get(SCORES, []))
         for seed in range(self._tuning.seeds):
             if seed == len(scores):
@@ -160,20 +161,20 @@ class Tuner:
                 print(f"{time.strftime('%H:%M:%S')} {run.key}", flush=True)
                 with locked([folder]):
                     scores.append(train(run, folder, lambda step, value: None, heartbeat.watch, device))
-                patiently(trial.set_user_attr, SCORES, scores)
+                trial.set_user_attr(SCORES, scores)
                 forget_states(folder)
             # Wilcoxon's test pairs the seeds; the other pruners compare the scores so far
             is_paired = self._tuning.pruner == "wilcoxon"
             value = scores[seed] if is_paired else SCORING[self._tuning.score](scores[: seed + 1])
-            patiently(trial.report, value, seed)
-            if seed + 1 < self._tuning.seeds and patiently(trial.should_prune):
+            trial.report(value, seed)
+            if seed + 1 < self._tuning.seeds and trial.should_prune():
                 return None
         return scores
 
     def _fail(self, trial_id: int, error: Exception) -> None:
         try:
-            patiently(self._storage.set_trial_user_attr, trial_id, ERROR, in_words(error))
-            patiently(self._storage.set_trial_state_values, trial_id, TrialState.FAIL)
+            self._storage.set_trial_user_attr(trial_id, ERROR, in_words(error))
+            self._storage.set_trial_state_values(trial_id, TrialState.FAIL)
         except UpdateFinishedTrialError:
             pass
 
