@@ -47,7 +47,8 @@ def test_interquartile_means() -> None:
 
 @pytest.mark.parametrize("configurations", [3, 10])
 def test_interquartile_means_over_configurations(configurations: int) -> None:
-    stated = re.search(r"Over several configurations with 4 runs of each it does in (\d+) %", words(READING))
+    sentence = r"Over several configurations with 4 runs of each the interval contains the true value in (\d+) %"
+    stated = re.search(sentence, words(READING))
     assert stated is not None
     rng = np.random.default_rng(3)
     # Each configuration's runs are drawn by themselves
