@@ -5,7 +5,7 @@ import multiprocessing
 import gymnasium as gym
 import numpy as np
 import pytest
-from environment_states import environment_state, obstacles
+from environment_states import assert_same, environment_state, obstacles
 from environments import Doubles
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -58,22 +58,6 @@ def closing():
     yield lambda env: made.append(env) or env
     for env in made:
         env.close()
-
-
-def assert_same(ours, theirs):
-    if isinstance(theirs, dict):
-        assert ours.keys() == theirs.keys()
-        for key in theirs:
-            assert_same(ours[key], theirs[key])
-    elif isinstance(theirs, list | tuple):
-        assert len(ours) == len(theirs)
-        for each, other in zip(ours, theirs, strict=True):
-            assert_same(each, other)
-    elif isinstance(theirs, np.ndarray):
-        assert ours.dtype == theirs.dtype
-        np.testing.assert_array_equal(ours, theirs)
-    else:
-        assert ours == theirs
 
 
 def without_times(infos):

@@ -14,6 +14,7 @@ from rl_zoo3.train import train
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import load_results
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from trainings import Interruption, assert_same
 
 from sb3_cgp import CGP
 from sb3_cgp.resumption.locks import FolderInUseError, FolderLock
@@ -26,10 +27,6 @@ from sb3_cgp.zoo.run_folders import LOCK_FILE, interpreter
 pytestmark = pytest.mark.usefixtures("short_episodes")
 
 CHECKPOINT = "{'sb3_cgp.TrainingCheckpointCallback': dict(save_freq=64)}"
-
-
-class Interruption(Exception):
-    """Whatever ends a process."""
 
 
 class Stop(BaseCallback):
@@ -93,12 +90,6 @@ def outcome(folder):
         if not tag.startswith("time/"):
             found[tag] = np.array([(event.step, event.value) for event in accumulator.Scalars(tag)])
     return found
-
-
-def assert_same(found, expected):
-    assert found.keys() == expected.keys()
-    for name, value in expected.items():
-        np.testing.assert_array_equal(found[name], value, err_msg=name, strict=True)
 
 
 @pytest.mark.parametrize(

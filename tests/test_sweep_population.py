@@ -7,7 +7,8 @@ import pytest
 import torch as th
 from rl_zoo3 import ALGOS
 from sweep_populations import NOISE, rows, write_sweep
-from test_sweep_run import Interruption, interrupt_at, policy_of, trained
+from test_sweep_run import interrupt_at, policy_of, trained
+from trainings import Interruption
 
 from benchmark.reporting.run_curves import read_curve
 from benchmark.reporting.zoo_runs import run_in

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from optuna.storages import InMemoryStorage
 from sweep_populations import NOISE, rows, study_of, write_sweep
-from test_sweep_run import Interruption, interrupt_at
+from test_sweep_run import interrupt_at
+from trainings import Interruption
 
 from benchmark.common.records import Record
 from benchmark.reporting.figures import figures

@@ -7,6 +7,7 @@ from rl_zoo3 import ALGOS
 from rl_zoo3.utils import get_saved_hyperparams
 from stable_baselines3 import TD3
 from stable_baselines3.common.env_util import make_vec_env
+from trainings import Interruption
 
 from benchmark.reporting.run_curves import read_curve
 from benchmark.reporting.zoo_runs import run_in
@@ -17,10 +18,6 @@ from sb3_cgp.resumption.algorithm import ResumableAlgorithm, resumable
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
 TINY = dict(learning_starts=20, batch_size=8, buffer_size=400, policy_kwargs="dict(net_arch=[8, 8])")
-
-
-class Interruption(Exception):
-    """Whatever may end a training; not the run's own fault in these tests."""
 
 
 @pytest.fixture
