@@ -17,6 +17,7 @@ from sb3_cgp.common.random_state import preserved_random_state
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.spaces import by_key, sample_of
 from sb3_cgp.guards.observations import innermost
+from sb3_cgp.guards.scores import check_scores
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
@@ -93,7 +94,8 @@ def try_networks(model: OffPolicyAlgorithm) -> None:
     a policy that cannot be copied, are not tried.
 
     :param model: the model, its networks made
-    :raises ValueError: if a network fails or returns a wrong shape, naming the network and the observation space
+    :raises ValueError: if a network fails or returns a wrong shape, naming the network and the observation space, or if the
+        selector would choose actions by other values than the critic learns
     """
     if not (hasattr(model.policy, "actor") and hasattr(model.policy, "critic")):
         return
@@ -104,17 +106,18 @@ def try_networks(model: OffPolicyAlgorithm) -> None:
         return
     with preserved_random_state(model.device):
         try:
-            _try_on(policy, model, is_random=True)
+            observations = _try_on(policy, model, is_random=True)
         except ValueError as error:
             # The environment may use a part of its space only, for which the networks are made
             try:
-                _try_on(policy, model, is_random=False)
+                observations = _try_on(policy, model, is_random=False)
             except ValueError:
                 raise error from error.__cause__
+        check_scores(policy, model, observations)
 
 
-def _try_on(policy: Any, model: OffPolicyAlgorithm, is_random: bool) -> None:
-    """Try a copied policy on a batch of random observations, or of zeros where the space has them."""
+def _try_on(policy: Any, model: OffPolicyAlgorithm, is_random: bool) -> Any:
+    """Try a copied policy on a batch of random observations, or of zeros where the space has them, and return the batch."""
     batch_size = min(model.batch_size, 3)
     observations = _make_observations(model.observation_space, batch_size, model.device, is_random)
     actions = th.zeros(batch_size, get_action_dim(model.action_space), device=model.device)
@@ -126,6 +129,7 @@ def _try_on(policy: Any, model: OffPolicyAlgorithm, is_random: bool) -> None:
         for critic in (policy.critic, policy.critic_target):
             with _naming_selector(), th.no_grad():
                 _require_selection(policy.select_actions(observations, critic), actions)
+    return observations
 
 
 def _try_training(network: th.nn.Module, call: Callable[[], Any], shape: tuple[int, ...]) -> None:
