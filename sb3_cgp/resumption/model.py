@@ -27,6 +27,7 @@ class RunningTraining:
     :param folder_locks: the locks that the training holds
     :param n_nested: a policy's offline training may run within `learn`
     :param warned_of: the warnings about the training state that were given
+    :param checked_optimizers: the optimizers that a resumed training has, too, by name
     """
 
     callback: BaseCallback | None = None
@@ -35,6 +36,7 @@ class RunningTraining:
     folder_locks: Mapping[Path, FolderLock] = field(default_factory=dict)
     n_nested: int = 0
     warned_of: frozenset[str] = frozenset()
+    checked_optimizers: Mapping[str, Any] = field(default_factory=dict)
 
 
 class ResumableModel(TransientAttributes):

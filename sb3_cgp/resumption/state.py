@@ -24,6 +24,7 @@ from sb3_cgp.resumption.callback_states import callback_states, restore_callback
 from sb3_cgp.resumption.environments import restore_environment, state_and_obstacles
 from sb3_cgp.resumption.logs import tensorboard_folder
 from sb3_cgp.resumption.model import ResumableModel, State
+from sb3_cgp.resumption.parameters import check_optimizers, frozen_parameters
 from sb3_cgp.resumption.plain_data import NUMERIC, plain_attributes, set_plain_attributes
 from sb3_cgp.resumption.replay_buffers import replay_buffer_state
 
@@ -39,8 +40,10 @@ def gather(model: ResumableModel, callback: BaseCallback) -> State:
     :param model: the model
     :param callback: the training's callbacks
     :return: the state; it may share arrays with the training, which will change them
+    :raises ValueError: if an optimizer was set on the model that a resumed training would not have
     """
     assert model.env is not None
+    check_optimizers(model)
     model._before_saving_state()
     zipped = io.BytesIO()
     model.save(zipped)
@@ -58,6 +61,7 @@ def gather(model: ResumableModel, callback: BaseCallback) -> State:
         "algorithm": type(model).__name__,
         "n_envs": model.n_envs,
         "model": zipped.getvalue(),
+        "frozen": frozen_parameters(model.policy),
         "replay_buffer": replay_buffer_state(model._ensure_replay_buffer()),
         "environment": environment,
         "not_restorable": " ".join(obstacles) or None,

@@ -1,0 +1,138 @@
+"""Frozen parameters stay frozen in a resumed training, and no state is saved that the policy's optimizers cannot load."""
+
+import pytest
+import torch as th
+from stable_baselines3 import DQN, SAC, TD3
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from trainings import Do, Interruption, parameters_equal
+
+from sb3_cgp import CGP, MlpPolicy
+from sb3_cgp.resumption import TrainingCheckpointCallback, resumable
+from sb3_cgp.resumption.state import gather
+from sb3_cgp.resumption.store import StateStore
+
+ARGUMENTS = dict(learning_starts=20, buffer_size=150, batch_size=8, seed=0, device="cpu")
+ALGORITHMS = [resumable(TD3), CGP]
+
+
+def make_model(algorithm, **arguments):
+    arguments = ARGUMENTS | dict(policy_kwargs=dict(net_arch=[8, 8])) | arguments
+    return algorithm(arguments.pop("policy", "MlpPolicy"), arguments.pop("env", "Pendulum-v1"), **arguments)
+
+
+def with_frozen_first_layers(model):
+    for network in (model.actor, model.critic):
+        for parameter in list(network.parameters())[:2]:
+            parameter.requires_grad_(False)
+    return model
+
+
+def raise_interruption():
+    raise Interruption
+
+
+def interrupted(model, folder, step=57):
+    with pytest.raises(Interruption):
+        model.learn(90, [TrainingCheckpointCallback(10, folder), Do(step, raise_interruption)])
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_parameters_that_were_frozen_are_not_trained_by_the_resumed_training(algorithm, tmp_path):
+    straight = with_frozen_first_layers(make_model(algorithm)).learn(90)
+    interrupted(with_frozen_first_layers(make_model(algorithm)), tmp_path)
+    resumed = algorithm.resume(tmp_path, "Pendulum-v1").learn(90)
+    assert parameters_equal(resumed, straight)
+    initial = make_model(algorithm)
+    assert th.equal(resumed.actor.mu[0].weight, initial.actor.mu[0].weight)
+    assert not th.equal(resumed.actor.mu[2].weight, initial.actor.mu[2].weight)
+
+
+def test_parameters_that_were_released_are_trained_by_the_resumed_training(tmp_path):
+    class Frozen(MlpPolicy):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            self.actor.requires_grad_(False)
+
+    model = make_model(CGP, policy=Frozen)
+    model.actor.requires_grad_(True)
+    interrupted(model, tmp_path)
+    resumed = CGP.resume(tmp_path, "Pendulum-v1")
+    before = resumed.actor.mu[0].weight.clone()
+    assert not th.equal(resumed.learn(90).actor.mu[0].weight, before)
+
+
+def test_a_state_of_an_earlier_version_is_resumed(tmp_path, monkeypatch):
+    def gather_as_before(*args):
+        state = gather(*args)
+        del state["frozen"]
+        return state
+
+    monkeypatch.setattr("sb3_cgp.resumption.callbacks.gather", gather_as_before)
+    interrupted(make_model(CGP), tmp_path)
+    assert parameters_equal(CGP.resume(tmp_path, "Pendulum-v1").learn(90), make_model(CGP).learn(90))
+
+
+OPTIMIZERS = {
+    "SGD of 6 parameters": lambda actor: th.optim.SGD(actor.parameters(), lr=1e-3),
+    "AdamW of 6 parameters": lambda actor: th.optim.AdamW(actor.parameters(), lr=1e-3),
+    "Adam of 2 parameters": lambda actor: th.optim.Adam(actor.mu[-2].parameters(), lr=1e-3),
+    "Adam of 6 parameters": lambda actor: th.optim.Adam(reversed(list(actor.parameters())), lr=1e-3),
+}
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_an_optimizer_that_cannot_be_resumed_is_refused_before_the_first_step(algorithm, optimizer, tmp_path):
+    model = make_model(algorithm)
+    model.actor.optimizer = OPTIMIZERS[optimizer](model.actor)
+    message = f"`model.actor.optimizer` is {optimizer}, but the policy makes .*Adam of 6 .*`policy_kwargs=.*`requires_grad_"
+    with pytest.raises(ValueError, match=message):
+        model.learn(90, TrainingCheckpointCallback(20, tmp_path))
+    assert model.num_timesteps == 0
+    model.learn(30)
+
+
+def test_another_implementation_of_adam_is_refused_as_it_rounds_otherwise(tmp_path):
+    model = make_model(CGP)
+    model.critic.optimizer = th.optim.Adam(model.critic.parameters(), lr=1e-3)
+    with pytest.raises(ValueError, match=r"`model.critic.optimizer` is Adam of .*, but the policy makes fused Adam of"):
+        model.learn(90, TrainingCheckpointCallback(20, tmp_path))
+
+
+def test_an_optimizer_that_is_exchanged_within_the_training_is_refused_at_the_next_state(tmp_path):
+    model = make_model(CGP)
+
+    def exchange():
+        model.actor.optimizer = th.optim.SGD(model.actor.parameters(), lr=1e-3)
+
+    with pytest.raises(ValueError, match=r"`model.actor.optimizer` is SGD"):
+        model.learn(90, [TrainingCheckpointCallback(20, tmp_path), Do(50, exchange)])
+    assert StateStore(tmp_path).steps() == [20, 40]
+    assert CGP.resume(tmp_path, "Pendulum-v1").learn(90).num_timesteps == 90
+
+
+class OwnOptimizers(MlpPolicy):
+    """Makes an optimizer of another class, of a part of the actor."""
+
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        self.actor.optimizer = th.optim.SGD(self.actor.mu[-2].parameters(), lr=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "arguments"),
+    [
+        (SAC, dict(policy_kwargs=dict(net_arch=[8], share_features_extractor=True))),
+        (DQN, dict(env="CartPole-v1")),
+        (TD3, dict(policy_kwargs=dict(optimizer_class=th.optim.SGD))),
+        (CGP, dict(policy=OwnOptimizers)),
+        (CGP, dict(policy_kwargs=dict(net_arch=[8], optimizer_kwargs=dict(fused=False)))),
+        (CGP, dict(policy_kwargs=dict(features_extractor_class=FlattenExtractor, share_features_extractor=True))),
+    ],
+    ids=str,
+)
+def test_the_policies_own_optimizers_are_saved_and_resumed(algorithm, arguments, tmp_path):
+    algorithm = resumable(algorithm)
+    interrupted(make_model(algorithm, **arguments), tmp_path)
+    resumed = algorithm.resume(tmp_path, arguments.get("env", "Pendulum-v1")).learn(90)
+    assert parameters_equal(resumed, make_model(algorithm, **arguments).learn(90))
