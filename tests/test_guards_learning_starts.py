@@ -27,16 +27,36 @@ def test_a_training_without_a_gradient_step_warns_and_no_other_does(
         return
     arguments = SMALL | dict(train_freq=train_freq, gradient_steps=gradient_steps, learning_starts=learning_starts)
     model = GuardedTD3("MlpPolicy", located(n_envs, length=5), **arguments)
+    n_warnings = 0
     for total_timesteps in (first_steps, 8, 2) if first_steps else (9,):
         updates = model._n_updates
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
-            model.learn(total_timesteps, reset_num_timesteps=False)
-        assert len(warned) == (model._n_updates == updates)
+            model.learn(total_timesteps, reset_num_timesteps=not first_steps)
+        # Once of trainings that continue each other
+        assert len(warned) == (model._n_updates == updates and n_warnings == 0)
+        n_warnings += len(warned)
         if warned:
             message = str(warned[0].message)
+            assert message.startswith("Nothing is learnt yet: " if first_steps else "Nothing is learnt: ")
             assert f"ends at environment step {model.num_timesteps}, " in message
             assert f"after step learning_starts={learning_starts}" in message
+
+
+@pytest.mark.parametrize("n_steps", [1, 100])
+def test_a_loop_of_trainings_that_continue_each_other_is_not_told_to_change_what_is_right(n_steps, capsys):
+    model = GuardedTD3("MlpPolicy", located(), **(SMALL | dict(learning_starts=3 * n_steps, verbose=1)))
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        for _ in range(5):
+            model.learn(n_steps, reset_num_timesteps=False)
+    assert model._n_updates == 2 * n_steps
+    expected = r"Nothing is learnt yet: .* Continue with `reset_num_timesteps=False` beyond that step\. This is said once\."
+    assert re.match(expected, *(str(each.message) for each in warned))
+    assert "smaller `learning_starts`" not in f"{warned[0].message}{capsys.readouterr().out}"
+    # A training that begins anew is judged alone
+    with pytest.warns(UserWarning, match=r"Nothing is learnt: .* a smaller `learning_starts`, such as"):
+        model.learn(n_steps)
 
 
 def limited(length):
@@ -73,27 +93,22 @@ def test_episodes_that_cannot_become_long_enough_are_warned_of_before_the_first_
 
 
 @pytest.mark.parametrize(
-    ("steps", "reset", "remedy"),
-    [
-        ((50,), True, "such as 5."),
-        ((150, 50), True, "such as 5, or continue .* `reset_num_timesteps=False`."),
-        ((40, 40), False, "such as 44."),
-    ],
+    ("steps", "remedy"),
+    [((50,), "such as 5."), ((150, 50), "such as 5, or continue .* `reset_num_timesteps=False`.")],
 )
-def test_the_remedy_takes_gradient_steps(steps, reset, remedy):
+def test_the_remedy_takes_gradient_steps(steps, remedy):
     model = GuardedTD3("MlpPolicy", located(), **(SMALL | dict(learning_starts=100)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for n in steps[:-1]:
-            model.learn(n, reset_num_timesteps=reset)
+            model.learn(n)
     before = model._n_updates
     with pytest.warns(UserWarning, match=remedy) as warned:
-        model.learn(steps[-1], reset_num_timesteps=reset)
+        model.learn(steps[-1])
     assert model._n_updates == before
     fresh = GuardedTD3("MlpPolicy", located(), **SMALL)
     fresh.learning_starts = int(re.search(r"such as (\d+)", str(warned[0].message))[1])
-    fresh.num_timesteps = 0 if reset else sum(steps[:-1])
-    fresh.learn(steps[-1], reset_num_timesteps=reset)
+    fresh.learn(steps[-1])
     assert fresh._n_updates > 0
 
 
@@ -138,6 +153,17 @@ def test_a_population_that_learns_nothing_is_warned_of_by_the_steps_of_an_agent(
     )
     with pytest.warns(UserWarning, match=message):
         population.learn(80)
+
+
+def test_a_population_whose_trainings_continue_each_other_is_warned_once():
+    population = Population("MlpPolicy", "Pendulum-v1", [dict(learning_starts=each) for each in (0, 50)], **POPULATION)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        for _ in range(3):
+            population.learn(20, reset_num_timesteps=False)
+    assert re.match(
+        "Agent 1 learns nothing yet: .* step 10 of each agent, .*=50. Continue", *(str(each.message) for each in warned)
+    )
 
 
 @pytest.mark.parametrize("overlap", [False, True])

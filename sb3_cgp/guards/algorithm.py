@@ -196,7 +196,7 @@ class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
             check_contents(self.replay_buffer)
         with self._beginning_episodes(reset_num_timesteps):
             result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
-            self._announce_warm_up(result[0])
+            self._announce_warm_up(result[0], continues=not reset_num_timesteps)
         # The environment has been reset, if it has to be
         self._begin_checks()
         fit_replay_buffer(self)

@@ -20,7 +20,8 @@ class LearningStartsGuard(OffPolicyAlgorithm):
     Of several agents that the environments are divided among, it names those that learn nothing.
 
     It warns when the training starts. Where the length of the last episode decides, and episodes have no known limit, it warns
-    when the training has ended. It does not warn of ``gradient_steps=0``, which says so itself.
+    when the training has ended. It does not warn of ``gradient_steps=0``, which says so itself. Of trainings that continue
+    each other, with ``reset_num_timesteps=False``, it warns once.
 
     With ``verbose=1`` it prints how many steps are random.
     """
@@ -29,6 +30,9 @@ class LearningStartsGuard(OffPolicyAlgorithm):
     _n_updates_at_start: int = 0
     # The warning of this training, which is not repeated at its end
     _has_warned: bool = False
+    # Whether this training counts its steps from those before it, and may be followed by others
+    _continues: bool = False
+    _has_said_not_yet: bool = False
 
     @contextmanager
     def _expecting_gradient_steps(self) -> Iterator[None]:
@@ -40,8 +44,9 @@ class LearningStartsGuard(OffPolicyAlgorithm):
         if self._trains_by_episode and has_ended and not has_trained and not self._has_warned:
             self._warn_of_no_gradient_step(self.num_timesteps)
 
-    def _announce_warm_up(self, total_timesteps: int) -> None:
+    def _announce_warm_up(self, total_timesteps: int, continues: bool) -> None:
         """Print how many steps are random, and warn if a training to ``total_timesteps`` will take no gradient step."""
+        self._continues = continues
         if self.num_timesteps < total_timesteps:
             self._print_warm_up(total_timesteps)
             last_timestep = self._last_timestep(total_timesteps)
@@ -68,7 +73,8 @@ class LearningStartsGuard(OffPolicyAlgorithm):
         n_random = [max(min(start, n_total) - n_done, 0) for start in starts]
         if self.verbose >= 1 and max(n_random) > 0:
             n_steps = n_total - n_done
-            advice = " That is more than half: a smaller `learning_starts` trains more." if 2 * max(n_random) > n_steps else ""
+            is_most = 2 * max(n_random) > n_steps and not self._continues
+            advice = " That is more than half: a smaller `learning_starts` trains more." if is_most else ""
             print(
                 f"Actions are random in the next {_range_in_words(n_random)} of {n_steps:,} environment steps"
                 f"{self._of_each_agent} (learning_starts={_range_in_words(starts, '')}), without gradient steps.{advice}"
@@ -89,25 +95,28 @@ class LearningStartsGuard(OffPolicyAlgorithm):
         last_timestep //= len(starts)
         # SB3 trains after a rollout that ends beyond `learning_starts`
         late = [agent for agent, start in enumerate(starts) if last_timestep <= start]
-        if not late or self.gradient_steps == 0:
+        if not late or self.gradient_steps == 0 or (self._continues and self._has_said_not_yet):
             return
         self._has_warned = True
+        self._has_said_not_yet |= self._continues
         subject, whose = ("Nothing is learnt", "") if len(late) == len(starts) else (_nothing_is_learnt_by(late), "their ")
         beyond = _range_in_words([starts[agent] for agent in late], "")
         # A tenth of the steps, as the documentation advises
-        start = self._num_timesteps_at_start // len(starts)
-        example = start + (last_timestep - start) // 10
-        has_learnt = self._n_updates > 0 and start == 0
-        continuing = ", or continue the training before this one with `reset_num_timesteps=False`" if has_learnt else ""
+        remedy = f"Give more `total_timesteps`, or a smaller `learning_starts`, such as {last_timestep // 10}"
+        if self._continues:
+            # A smaller `learning_starts` would be right for this training, and too small for all of them together
+            subject, remedy = f"{subject} yet", "Continue with `reset_num_timesteps=False` beyond that step. This is said once"
+        elif self._n_updates > 0:
+            remedy += ", or continue the training before this one with `reset_num_timesteps=False`"
         warnings.warn(
             f"{subject}: the training ends at environment step {last_timestep}{self._of_each_agent}{certainty}, and "
-            f"{whose}gradient steps begin after step learning_starts={beyond}. "
-            f"Give more `total_timesteps`, or a smaller `learning_starts`, such as {example}{continuing}.",
+            f"{whose}gradient steps begin after step learning_starts={beyond}. {remedy}.",
             stacklevel=2,
         )
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_n_updates_at_start", "_has_warned"]
+        own = ["_n_updates_at_start", "_has_warned", "_continues", "_has_said_not_yet"]
+        return [*super()._excluded_save_params(), *own]
 
 
 def _range_in_words(numbers: Sequence[int], thousands: str = ",") -> str:
