@@ -74,6 +74,17 @@ def test_constructor_arguments_and_attributes_can_be_changed_by_load(name, value
     assert getattr(CGP.load(saved, **{name: value}), name) == value
 
 
+@pytest.mark.parametrize("n_envs", [2, "1"])
+def test_a_number_that_is_not_the_environments_is_refused_by_load(n_envs, saved, tmp_path):
+    message = rf"`n_envs` is {n_envs!r}, but must be left out, or 1, as many as `env` has"
+    with pytest.raises(ValueError, match=message):
+        CGP.load(saved, make_model().get_env(), n_envs=n_envs)
+    population = Population("MlpPolicy", "Pendulum-v1", 1, buffer_size=100, policy_kwargs=dict(net_arch=[4]))
+    population.save(tmp_path / "population")
+    with pytest.raises(ValueError, match=message):
+        Population.load(tmp_path / "population", "Pendulum-v1", n_envs=n_envs)
+
+
 def test_an_open_file_is_read_from_its_position(saved):
     content = saved.with_suffix(".zip").read_bytes()
     file = io.BytesIO(content)

@@ -173,8 +173,18 @@ def test_what_does_not_fit_is_refused(tmp_path):
         CGP.resume(tmp_path / "state", make_vec_env("Pendulum-v1", n_envs=3))
     with pytest.raises(ValueError, match=r"`buffer_size` is 20, but must be at least 40"):
         CGP.resume(tmp_path / "state", training.make_env(1), buffer_size=20)
+    with pytest.raises(ValueError, match=r"`n_envs` is 3, but must be left out, or 1"):
+        CGP.resume(tmp_path / "state", training.make_env(1), n_envs=3)
     with pytest.raises(FileNotFoundError, match="nowhere"):
         CGP.resume(tmp_path / "nowhere", training.make_env(1))
+
+
+def test_a_wrong_number_of_environments_is_named_by_an_algorithm_without_guards(tmp_path):
+    algorithm = resumable(TD3)
+    model = algorithm("MlpPolicy", "Pendulum-v1", buffer_size=50, policy_kwargs=dict(net_arch=[4]))
+    model.learn(10, TrainingCheckpointCallback(10, tmp_path))
+    with pytest.raises(ValueError, match=r"`n_envs` is 2, but must be 1, as was saved"):
+        algorithm.resume(tmp_path, "Pendulum-v1", n_envs=2)
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])

@@ -82,16 +82,18 @@ def check_policy_name(name: str, aliases: Mapping[str, type[BasePolicy]]) -> Non
 
 def check_policy_and_env(model: OffPolicyAlgorithm) -> None:
     """
-    Check that a model whose networks are to be made has a class of policies, and spaces.
+    Check that a model whose networks are to be made has a class of policies, and spaces, and counts its environments.
 
     :param model: the model
-    :raises ValueError: if the policy is no class, or there is no environment
+    :raises ValueError: if the policy is no class, there is no environment, or ``load`` was given another number of them
     """
     allowed = f"a class of policies, or one of {', '.join(map(repr, model.policy_aliases))}"
     require(isinstance(model.policy_class, type), "policy", model.policy_class, allowed)
     # `load` sets the spaces where there is no environment
     has_space = getattr(model, "observation_space", None) is not None
     require(has_space, "env", None, f"{ENVIRONMENT}: only `load` needs none")
+    n_envs = model.n_envs if model.env is None else model.env.num_envs
+    require(model.n_envs == n_envs, "n_envs", model.n_envs, f"left out, or {n_envs}, as many as `env` has")
 
 
 @contextmanager

@@ -193,7 +193,8 @@ class Population(ResumableAlgorithm, PopulationMembers):
         :raises ValueError: if there are more or fewer than agents, or they share the statistics of ``VecNormalize``
         """
         allowed = f"{len(self)}, as many as agents: environment i is agent i's"
-        require(self.env is None or self.n_envs == len(self), "env.num_envs", self.n_envs, allowed)
+        n_envs = len(self) if self.env is None else self.env.num_envs
+        require(n_envs == len(self), "env.num_envs", n_envs, allowed)
         allowed = "without VecNormalize, whose statistics all agents would share"
         require(self._vec_normalize_env is None, "env", self.env, allowed)
 

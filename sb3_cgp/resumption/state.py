@@ -132,8 +132,10 @@ def check_fits(model: ResumableModel, state: State) -> None:
     :param state: the state
     :raises ValueError: if the number of environments differs, or only one of both has ``VecNormalize``
     """
+    assert model.env is not None
     n_envs, saved = state["n_envs"], f"{state['n_envs']}, as was saved"
-    require(model.n_envs == n_envs, "env.num_envs", model.n_envs, saved)
+    require(model.env.num_envs == n_envs, "env.num_envs", model.env.num_envs, saved)
+    require(model.n_envs == n_envs, "n_envs", model.n_envs, saved)
     noises = getattr(model.action_noise, "noises", None)
     require(noises is None or len(noises) == n_envs, "action_noise.n_envs", len(noises or ()), saved)
     is_normalized, was_normalized = model.get_vec_normalize_env() is not None, state["statistics"] is not None
