@@ -15,6 +15,7 @@ from small_models import make_model
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_cgp import CGP
 from sb3_cgp.common.sb3_arguments import constructor_argument_names
@@ -274,6 +275,74 @@ def test_a_wrong_argument_of_the_policy_is_refused_by_name(name, value, allowed)
     message = re.escape(f"The value of `policy_kwargs['{name}']` is {value!r}, but must be {allowed}")
     with pytest.raises(ValueError, match=message):
         make(policy_kwargs={name: value})
+
+
+@pytest.mark.parametrize("algorithm", [CGP, GuardedTD3, lambda *args, **kwargs: Population(*args, 2, **kwargs)])
+def test_a_learning_rate_among_the_optimizers_arguments_is_sent_to_the_algorithm(algorithm):
+    message = r"`policy_kwargs\['optimizer_kwargs'\]\['lr'\]` is 0.1, but must be left out: give `learning_rate` to the"
+    with pytest.raises(ValueError, match=message):
+        make(algorithm=algorithm, policy_kwargs=dict(optimizer_kwargs=dict(lr=0.1)))
+
+
+@pytest.fixture
+def float64():
+    th.set_default_dtype(th.float64)
+    yield
+    th.set_default_dtype(th.float32)
+
+
+@pytest.mark.parametrize("algorithm", [CGP, GuardedTD3, lambda *args, **kwargs: Population(*args, 2, **kwargs)])
+def test_another_default_data_type_is_named_as_the_cause(algorithm, saved, float64):
+    message = r"`torch.get_default_dtype\(\)` is torch.float64, but must be torch.float32, .* `torch.set_default_dtype"
+    with pytest.raises(ValueError, match=message):
+        make(algorithm=algorithm)
+    with pytest.raises(ValueError, match=message):
+        CGP.load(saved)
+
+
+class Casting(FlattenExtractor):
+    def forward(self, observations):
+        return super().forward(observations).double()
+
+
+def test_networks_that_compute_in_another_default_data_type_are_taken(float64):
+    class Policy(TD3Policy):
+        def make_actor(self, features_extractor=None):
+            actor = super().make_actor(features_extractor)
+            actor.mu.append(ToFloat32())
+            return actor
+
+    class ToFloat32(th.nn.Module):
+        def forward(self, actions):
+            return actions.float()
+
+    make(Policy, algorithm=GuardedTD3, policy_kwargs=dict(net_arch=[4], features_extractor_class=Casting))
+
+
+class Images(gym.Env):
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, space):
+        self.observation_space = space
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}
+
+
+@pytest.mark.parametrize("shape", [(8, 8, 3), (36, 35, 1), (3, 20, 20)], ids=str)
+@pytest.mark.parametrize("policy", ["CnnPolicy", "MultiInputPolicy"])
+@pytest.mark.parametrize("algorithm", [CGP, GuardedTD3])
+def test_images_that_are_too_small_for_sb3s_network_are_refused_with_the_remedy(algorithm, policy, shape):
+    space = gym.spaces.Box(0, 255, shape, np.uint8)
+    env = Images(space if policy == "CnnPolicy" else gym.spaces.Dict(camera=space))
+    shape = shape if shape[0] == 3 else (shape[2], *shape[:2])
+    message = rf"`observation_space` is Box\(0, 255, {re.escape(str(shape))}, uint8\), .* at least 36 x 36 pixels .*Resize"
+    with pytest.raises(ValueError, match=message):
+        make(policy, env, algorithm, policy_kwargs={})
+
+
+def test_the_smallest_images_are_taken():
+    make("CnnPolicy", Images(gym.spaces.Box(0, 255, (36, 36, 1), np.uint8)), policy_kwargs={})
 
 
 @pytest.mark.parametrize(

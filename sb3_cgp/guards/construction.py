@@ -3,6 +3,7 @@
 import functools
 import inspect
 import os
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from numbers import Real
@@ -14,6 +15,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import NatureCNN
 from stable_baselines3.common.utils import get_device
 from torch import nn
 
@@ -104,7 +106,8 @@ def explaining_policy(model: OffPolicyAlgorithm) -> Iterator[None]:
     Not beforehand, as a policy of the user's own may take other arguments and values.
 
     :param model: the model whose policy is made within the context
-    :raises ValueError: if the policy is for other observations, or the value of an argument of SB3's policies is wrong
+    :raises ValueError: if the policy is for other observations, the value of an argument of SB3's policies is wrong, or
+        PyTorch's default data type is not float32
     :raises TypeError: if the policy takes no such argument
     """
     try:
@@ -113,13 +116,14 @@ def explaining_policy(model: OffPolicyAlgorithm) -> Iterator[None]:
     except Exception as error:
         try:
             _check_policy(model)
+            _check_images(error)
         except ValueError as explanation:
             raise explanation from error
         raise
 
 
 def _check_policy(model: OffPolicyAlgorithm) -> None:
-    """Check that SB3's policy for ``Dict`` observations is given such, and the arguments of SB3's policies."""
+    """Check that SB3's policy for ``Dict`` observations is given such, the arguments of SB3's policies, and the data type."""
     multi_input = model.policy_aliases.get("MultiInputPolicy")
     is_multi_input = multi_input is not None and issubclass(model.policy_class, multi_input)
     is_shared = multi_input is model.policy_aliases.get("MlpPolicy")
@@ -128,6 +132,22 @@ def _check_policy(model: OffPolicyAlgorithm) -> None:
         is_dict = isinstance(model.observation_space, spaces.Dict)
         require(is_dict, "policy", model.policy_class.__name__, allowed)
     check_policy_arguments(model.policy_kwargs)
+    allowed = (
+        "torch.float32, of which SB3's tensors are: call `torch.set_default_dtype(torch.float32)` before the model is made"
+    )
+    require(th.get_default_dtype() == th.float32, "torch.get_default_dtype()", th.get_default_dtype(), allowed)
+
+
+def _check_images(error: Exception) -> None:
+    """Name the images if the error is that they are too small for SB3's ``NatureCNN``."""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        if frame.f_code is NatureCNN.__init__.__code__ and "Kernel size can't be greater" in str(error):
+            allowed = (
+                "of images of at least 36 x 36 pixels for SB3's NatureCNN: enlarge them, as "
+                "`gymnasium.wrappers.ResizeObservation(env, (84, 84))` does, or give another features extractor, "
+                "`policy_kwargs=dict(features_extractor_class=...)`"
+            )
+            require(False, "observation_space", frame.f_locals["observation_space"], allowed)
 
 
 def check_constructor_arguments(given: Mapping[str, Any]) -> None:
@@ -166,6 +186,8 @@ def check_policy_arguments(given: Mapping[str, Any]) -> None:
     for name in ("optimizer_kwargs", "features_extractor_kwargs"):
         is_valid = isinstance(given.get(name, {}), Mapping | None)
         require(is_valid, f"policy_kwargs['{name}']", given.get(name), "None or a dictionary")
+    rate = (given.get("optimizer_kwargs") or {}).get("lr")
+    require(rate is None, "policy_kwargs['optimizer_kwargs']['lr']", rate, "left out: give `learning_rate` to the algorithm")
     if "n_critics" in given:
         require_count("policy_kwargs['n_critics']", given["n_critics"])
     architecture = given.get("net_arch")
