@@ -73,6 +73,49 @@ def test_replies_of_workers_that_an_interruption_left_unread_are_not_taken_for_o
     env.close()
 
 
+def interrupt():
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("what", ["Ctrl-C", "step", "new training", "learn"])
+def test_a_monitor_that_refuses_early_resets_is_told_why_and_what_to_do(what):
+    env = DummyVecEnv([lambda: Monitor(Located(), allow_early_resets=False)])
+    model = GuardedTD3("MlpPolicy", env, **SMALL)
+    reasons = {
+        "Ctrl-C": "its last step was interrupted before it was stored",
+        "step": "it was reset or stepped outside of this training",
+        "learn": "it was reset or stepped outside of this training",
+        "new training": "a training that begins",
+    }
+    if what == "Ctrl-C":
+        with pytest.raises(KeyboardInterrupt):
+            model.learn(30, Do(10, interrupt))
+    else:
+        model.learn(10)
+    if what == "step":
+        env.step(np.zeros((1, 1)))
+    # In the middle of a training, or at its start
+    callback = Do(2, lambda: env.step(np.zeros((1, 1)))) if what == "learn" else None
+    message = rf"reset in the middle of an episode: {reasons[what]}.*`Monitor\(env, allow_early_resets=True\)`, or .*`set_env`"
+    with pytest.raises(RuntimeError, match=message):
+        model.learn(10, callback, reset_num_timesteps=what == "new training")
+    n_before = model.num_timesteps
+    model.set_env(Monitor(Located(), allow_early_resets=False))
+    assert model.learn(7, reset_num_timesteps=False).num_timesteps == n_before + 7
+
+
+def test_another_error_of_a_reset_reaches_the_user_unchanged():
+    env = Located()
+    model = GuardedTD3("MlpPolicy", Monitor(env), **SMALL).learn(10)
+
+    def fail(**kwargs):
+        raise RuntimeError("the robot does not answer")
+
+    env.reset = fail
+    with pytest.raises(RuntimeError, match=r"^the robot does not answer$"):
+        model.learn(10)
+
+
 def test_nested_trainings_leave_the_environment_as_it_was():
     env = located()
     inner = make_model("plain", env=env)

@@ -1,7 +1,9 @@
 """CGP's models saved and loaded: the same arguments, parameters and training."""
 
 import inspect
+import io
 import json
+import tempfile
 import warnings
 import zipfile
 
@@ -11,6 +13,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from small_models import make_model, same_parameters
+from stable_baselines3 import TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.td3.policies import TD3Policy
 
@@ -142,6 +145,18 @@ def test_a_loaded_model_goes_on_like_the_one_that_was_saved(tmp_path):
         each.set_logger(model.logger)
         each.train(gradient_steps=30, batch_size=16)
     assert same_parameters(model, loaded)
+
+
+@pytest.mark.parametrize("make_file", [io.StringIO, tempfile.NamedTemporaryFile, lambda: None])
+@pytest.mark.parametrize("method", ["save", "save_replay_buffer"])
+def test_a_file_object_that_sb3_does_not_take_is_refused_as_by_sb3(method, make_file):
+    errors = []
+    for algorithm in (TD3, CGP):
+        model, file = algorithm("MlpPolicy", "Pendulum-v1", buffer_size=10, policy_kwargs=dict(net_arch=[4])), make_file()
+        with pytest.raises(TypeError, match=r"parameter has invalid type: expected one of .*BytesIO") as caught:
+            getattr(model, method)(file)
+        errors.append(str(caught.value).replace(str(file), ""))
+    assert errors[0] == errors[1]
 
 
 def test_get_and_set_parameters():

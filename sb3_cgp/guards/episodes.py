@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_cgp.common.replay_buffers import end_last_episode
 from sb3_cgp.common.transient import TransientAttributes
+from sb3_cgp.guards.explanations import explaining_early_reset
 from sb3_cgp.guards.observations import (
     continues_last_episode,
     count_envs,
@@ -23,6 +24,8 @@ from sb3_cgp.guards.observations import (
     same_observations,
     same_position,
 )
+
+MOVED = "it was reset or stepped outside of this training"
 
 
 class EpisodeGuard(TransientAttributes):
@@ -45,11 +48,16 @@ class EpisodeGuard(TransientAttributes):
     @contextmanager
     def _beginning_episodes(self, reset_num_timesteps: bool) -> Iterator[None]:
         """Let SB3 reset an environment that has moved, within the context, and end the last episode unless it goes on."""
-        if self._env_has_moved() or count_envs(self._original_last_obs) != self.n_envs:
-            # SB3 resets the environment then
+        reason = "a training that begins, or goes on in another environment, starts with an episode"
+        if self._env_has_moved():
+            reason = MOVED if self._own_step is None else "its last step was interrupted before it was stored"
             self._last_obs = None
+        elif count_envs(self._original_last_obs) != self.n_envs:
+            self._last_obs = None
+        # SB3 resets the environment then
         is_reset = reset_num_timesteps or self._last_obs is None
-        yield
+        with explaining_early_reset(reason):
+            yield
         self._has_warned_of_moves = False
         if is_reset:
             self._note_reset()
@@ -153,7 +161,8 @@ class EpisodeGuard(TransientAttributes):
     def _begin_episode(self, action_noise: ActionNoise | None) -> None:
         """Reset the environment during the training."""
         assert self.env is not None
-        self._last_obs = self.env.reset()  # type: ignore[assignment]
+        with explaining_early_reset(MOVED):
+            self._last_obs = self.env.reset()  # type: ignore[assignment]
         self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
         if self._vec_normalize_env is not None:
             self._last_original_obs = self._vec_normalize_env.get_original_obs()

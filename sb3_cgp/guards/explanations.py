@@ -1,4 +1,4 @@
-"""Errors of SB3's that name a symptom, and what they mean: the old API, rewards that are no numbers, too few episodes."""
+"""Errors of SB3's that name a symptom, and what they mean: the old API, rewards that are no numbers, early resets."""
 
 import linecache
 import re
@@ -49,6 +49,26 @@ def explaining_errors(model: OffPolicyAlgorithm) -> Iterator[None]:
         if message is None:
             raise
         raise ValueError(message) from error
+
+
+@contextmanager
+def explaining_early_reset(reason: str) -> Iterator[None]:
+    """
+    Say why an environment is reset, where a ``Monitor`` admits a reset at the end of an episode only.
+
+    :param reason: why it is reset, in the middle of an episode if need be
+    :raises RuntimeError: in place of the ``Monitor``'s
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+        if frame.f_code is not Monitor.reset.__code__:
+            raise
+        raise RuntimeError(
+            f"The environment has to be reset in the middle of an episode: {reason}. Its `Monitor` does not allow that: wrap "
+            "it in `Monitor(env, allow_early_resets=True)`, or give a new environment to `set_env`."
+        ) from error
 
 
 def check_reset_info(info: Any) -> None:

@@ -41,11 +41,12 @@ SelfResumableAlgorithm = TypeVar("SelfResumableAlgorithm", bound="ResumableAlgor
 @contextmanager
 def _whole(path: str | Path | io.BufferedIOBase, suffix: str) -> Iterator[Any]:
     """
-    Open a file that appears under its name when it is complete. Yield an open file as it is.
+    Open a file that appears under its name when it is complete. Yield anything but a path as it is, such as an open file.
 
     Add the suffix as SB3 does, and to the name of a folder, for which SB3 would choose a name that ``load`` does not find.
     """
-    if isinstance(path, io.BufferedIOBase):
+    if not isinstance(path, str | os.PathLike):
+        # SB3 names the files that it takes
         yield path
         return
     path = Path(path)
