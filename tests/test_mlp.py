@@ -111,6 +111,25 @@ def test_second_derivatives_are_those_of_the_sequence(name, rows):
         th.testing.assert_close(ours.double(), theirs, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_derivatives_of_parameters_that_occur_twice_are_those_of_the_sequence(is_shared):
+    """In one network, or in a network that is applied to its own outputs."""
+    layers = modules([N_INPUTS] if is_shared else [160, 128])
+    first = layers[0]
+    first, last = (first, first) if is_shared else (first, nn.Linear(layers[-1].in_features, N_INPUTS))
+    network = MLP(first, *layers[1:-1], last)
+    twin = copy.deepcopy(nn.Sequential(*network)).double()
+    inputs = th.randn(MANY_ROWS, N_INPUTS)
+
+    def derivatives(network, inputs):
+        outputs = network(network(inputs)).sin().sum()
+        firsts = th.autograd.grad(outputs, list(network.parameters()), create_graph=True)
+        return [*firsts, *th.autograd.grad(sum(each.square().sum() for each in firsts), list(network.parameters()))]
+
+    for ours, theirs in zip(derivatives(network, inputs), derivatives(twin, inputs.double()), strict=True):
+        th.testing.assert_close(ours.double(), theirs, rtol=1e-3, atol=1e-3)
+
+
 def test_on_intels_processors_the_networks_are_pytorchs(monkeypatch):
     network, inputs = MLP(*copy.deepcopy(NETWORKS["wide"])), th.randn(256, N_INPUTS)
     assert "ReLULayers" in network(inputs).grad_fn.name()

@@ -21,8 +21,8 @@ def onednn_linear(dtype: th.dtype) -> Callable[..., th.Tensor] | None:
     """
     Return oneDNN's linear layer, a private operator of PyTorch that its compiler uses.
 
-    PyTorch's public linear layer calls MKL for float32, which has half oneDNN's speed on AMD's processors, and is faster on
-    Intel's.
+    PyTorch's public linear layer calls MKL for float32, which has half oneDNN's speed on AMD's processors, and at least the
+    same on Intel's.
 
     :param dtype: the data type
     :return: the operator; None if PyTorch's linear layer is as fast, if PyTorch has no such operator for this processor, or if

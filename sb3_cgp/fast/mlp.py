@@ -101,6 +101,8 @@ def _differentiable_gradients(
     inputs: th.Tensor, parameters: Sequence[th.Tensor], gradient: th.Tensor, needed: Sequence[bool]
 ) -> tuple[th.Tensor | None, ...]:
     """Compute the gradients by PyTorch's own functions, which have second derivatives."""
+    # Views, so that a derivative does not follow the history of the inputs, which may depend on the same parameters
+    inputs, *parameters = (tensor if tensor is None else tensor.view_as(tensor) for tensor in (inputs, *parameters))
     outputs = inputs
     for index in range(0, len(parameters), 2):
         outputs = F.linear(outputs.relu() if index > 0 else outputs, parameters[index], parameters[index + 1])
