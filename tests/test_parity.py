@@ -219,8 +219,14 @@ def test_predicting_evaluates_a_features_extractor_that_was_exchanged():
     model = make_model(policy_kwargs=dict(net_arch=[16], features_extractor_class=NormalisedDropout))
     observation = np.zeros(3, np.float32)
     model.predict(observation)
-    model.actor.features_extractor = NormalisedDropout(model.observation_space)
-    assert np.array_equal(model.predict(observation)[0], model.predict(observation)[0])
+    for network in (model.actor, model.actor_target, model.critic, model.critic_target):
+        network.features_extractor = NormalisedDropout(model.observation_space)
+    for inference in ("actor", "averaged_actor"):
+        model.policy.inference = inference
+        assert np.array_equal(model.predict(observation)[0], model.predict(observation)[0])
+    # For bootstrapping
+    model.policy.select_actions(th.zeros(5, 3), model.critic_target)
+    assert model.critic_target.features_extractor.rows == [(5, False)]
 
 
 def test_observations_pass_the_features_extractor_once_per_state_never_per_sample():

@@ -14,10 +14,10 @@ def evaluation_mode(network: nn.Module) -> Iterator[None]:
 
     Neither dropout nor batch statistics disturb it then, and its running statistics do not change.
 
-    :param network: the network, whose submodules are in the same mode
+    :param network: the network. A submodule that is in training mode by itself remains in evaluation mode.
     """
     was_training = network.training
-    if was_training:
+    if any(module.training for module in network.modules()):
         network.eval()
     try:
         yield

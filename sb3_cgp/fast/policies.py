@@ -1,5 +1,6 @@
 """CGP's policies with the fast networks and the fast scoring."""
 
+from contextlib import nullcontext
 from itertools import chain
 from typing import Any
 
@@ -10,6 +11,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.td3.policies import Actor
 from torch import nn
 
+from sb3_cgp.common.networks import evaluation_mode
 from sb3_cgp.common.rules import require_choice
 from sb3_cgp.core import policies as core_policies
 from sb3_cgp.core.cem import Score
@@ -109,7 +111,9 @@ class CGPPolicy(policies.CGPPolicy):
             actions = self.recorded_selection(observation)[0]
             assert actions is not None
             return actions
-        return super()._predict(observation, deterministic)
+        # Before acting, SB3 sets the modes of the actor and the critic alone
+        with evaluation_mode(self.actor_target) if self.inference == "averaged_actor" else nullcontext():
+            return super()._predict(observation, deterministic)
 
 
 MlpPolicy = CGPPolicy
