@@ -1,9 +1,11 @@
 """Frozen parameters stay frozen in a resumed training, and no state is saved that the policy's optimizers cannot load."""
 
+from copy import deepcopy
+
 import pytest
 import torch as th
 from stable_baselines3 import DQN, SAC, TD3
-from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from trainings import Do, Interruption, parameters_equal
 
 from sb3_cgp import CGP, MlpPolicy
@@ -13,6 +15,15 @@ from sb3_cgp.resumption.store import StateStore
 
 ARGUMENTS = dict(learning_starts=20, buffer_size=150, batch_size=8, seed=0, device="cpu")
 ALGORITHMS = [resumable(TD3), CGP]
+
+
+class Linear(BaseFeaturesExtractor):
+    def __init__(self, observation_space):
+        super().__init__(observation_space, 4)
+        self.layer = th.nn.Linear(observation_space.shape[0], 4)
+
+    def forward(self, observations):
+        return self.layer(observations)
 
 
 def make_model(algorithm, **arguments):
@@ -59,6 +70,22 @@ def test_parameters_that_were_released_are_trained_by_the_resumed_training(tmp_p
     resumed = CGP.resume(tmp_path, "Pendulum-v1")
     before = resumed.actor.mu[0].weight.clone()
     assert not th.equal(resumed.learn(90).actor.mu[0].weight, before)
+
+
+def test_a_frozen_features_extractor_that_was_exchanged_is_resumed(tmp_path):
+    """The optimizers keep the parameters of the former ones, which nothing trains any more."""
+
+    def with_trained_extractors(model):
+        th.manual_seed(1)
+        extractor = Linear(model.observation_space).requires_grad_(False)
+        for network in (model.actor, model.actor_target, model.critic, model.critic_target):
+            network.features_extractor = deepcopy(extractor)
+        return model
+
+    arguments = dict(policy_kwargs=dict(net_arch=[8], features_extractor_class=Linear))
+    straight = with_trained_extractors(make_model(CGP, **arguments)).learn(90)
+    interrupted(with_trained_extractors(make_model(CGP, **arguments)), tmp_path)
+    assert parameters_equal(CGP.resume(tmp_path, "Pendulum-v1").learn(90), straight)
 
 
 def test_a_state_of_an_earlier_version_is_resumed(tmp_path, monkeypatch):

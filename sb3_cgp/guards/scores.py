@@ -9,8 +9,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_cgp.common.networks import evaluation_mode
 from sb3_cgp.common.random_state import preserved_random_state
 
-# The same operations on the same numbers, but for a GPU's order of sums; relative to the largest value
-TOLERANCE = 1e-4
+# Relative to the largest value: a critic may compute in bfloat16
+TOLERANCE = 2e-2
 
 
 def check_scores(policy: Any, model: OffPolicyAlgorithm, observations: Any) -> None:
@@ -47,7 +47,7 @@ def check_scores(policy: Any, model: OffPolicyAlgorithm, observations: Any) -> N
 
 
 def _require_equal_values(critic: Any, model: OffPolicyAlgorithm, observations: Any, actions: th.Tensor) -> None:
-    """Compare the values of one action for each observation, (B, A), by the critic's first network and by its methods."""
+    """Compare the values of one action for each observation, (B, A), by the critic's first network and by its ``forward``."""
 
     def evaluate(call: Callable[[], th.Tensor]) -> th.Tensor:
         # A features extractor may be random in evaluation mode, too
@@ -58,20 +58,15 @@ def _require_equal_values(critic: Any, model: OffPolicyAlgorithm, observations: 
         features = critic.extract_features(observations, critic.features_extractor)
         return critic.q_networks[0](th.cat([features, actions], dim=1))
 
-    scores = evaluate(score)
-    for name, call in {
-        "forward": lambda: critic(observations, actions)[0],
-        "q1_forward": lambda: critic.q1_forward(observations, actions),
-    }.items():
-        values = evaluate(call)
-        atol = TOLERANCE * float(scores.nan_to_num().abs().max())
-        if not th.allclose(values, scores, rtol=0.0, atol=atol, equal_nan=True):
-            raise ValueError(
-                f"The selector would choose actions by other values than the critic learns: `{type(critic).__name__}.{name}` "
-                f"returns {_in_words(values)}, where the critic's first network returns {_in_words(scores)} for the features "
-                f"and the actions. Override `make_score(q_network, features)` of `{type(model.policy).__name__}`, so that it "
-                f"returns a function that scores actions as `{name}` does."
-            )
+    scores, values = evaluate(score).float(), evaluate(lambda: critic(observations, actions)[0]).float()
+    atol = TOLERANCE * float(scores.nan_to_num().abs().max())
+    if not th.allclose(values, scores, rtol=0.0, atol=atol, equal_nan=True):
+        raise ValueError(
+            f"The selector would choose actions by other values than the critic learns: `{type(critic).__name__}.forward` "
+            f"returns {_in_words(values)}, where the critic's first network returns {_in_words(scores)} for the features and "
+            f"the actions. Override `make_score(q_network, features)` of `{type(model.policy).__name__}`, so that it returns "
+            "a function that scores actions as `forward` does."
+        )
 
 
 def _in_words(values: th.Tensor) -> str:

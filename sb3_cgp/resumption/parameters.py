@@ -51,10 +51,10 @@ def check_optimizers(model: ResumableModel) -> None:
             )
     except Exception:
         # An algorithm of the user's own may make its policy in another way
-        return
+        policy = None
     for name, optimizer in optimizers.items():
         made = recursive_getattr(policy, name.removeprefix("policy."), None)
-        if made is not None and _unsaved(optimizer, model.policy) != _unsaved(made, policy):
+        if made is not None and _unsaved(optimizer, model.policy, model.policy) != _unsaved(made, policy, model.policy):
             raise ValueError(
                 f"`model.{name}` is {_in_words(optimizer)}, but the policy makes {_in_words(made)}, into which `resume` "
                 "would load the saved state. Where the training is saved, choose optimizers by "
@@ -64,9 +64,14 @@ def check_optimizers(model: ResumableModel) -> None:
     model._note_training(checked_optimizers=optimizers)
 
 
-def _unsaved(optimizer: th.optim.Optimizer, policy: BasePolicy) -> Any:
-    """Return what no state sets: an optimizer's class, its implementation, and the names of its parameters by group."""
-    names = {id(parameter): name for name, parameter in policy.named_parameters()}
+def _unsaved(optimizer: th.optim.Optimizer, policy: BasePolicy, trained: BasePolicy) -> Any:
+    """
+    Return what no state sets: an optimizer's class, its implementation, and the names of its parameters by group.
+
+    Parameters that are frozen in the ``trained`` policy, or replaced by others that are, count as equal.
+    """
+    frozen = frozen_parameters(trained)
+    names = {id(parameter): name for name, parameter in policy.named_parameters() if name not in frozen}
     groups = [[names.get(id(parameter)) for parameter in group["params"]] for group in optimizer.param_groups]
     return type(optimizer), bool(optimizer.defaults.get("fused")), groups
 
