@@ -93,6 +93,8 @@ def test_schedules_are_tried_from_the_beginning_to_the_end(name):
         make_model(**{name: lambda remaining: 1e-3 * (remaining - 0.1)})
     with pytest.raises(ValueError, match=rf"`{name}` is .* must be a schedule .*; at 0.0 it raises ZeroDivisionError"):
         make_model(**{name: lambda remaining: 1e-3 / remaining})
+    with pytest.raises(ValueError, match=rf"`{name}` is .* must be a schedule .*; at 0.0 it raises IndexError"):
+        make_model(**{name: lambda remaining: [1e-3, 1e-4][int((1 - remaining) * 2)]})
 
 
 def test_noise_of_several_environments_is_checked_too():

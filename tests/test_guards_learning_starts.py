@@ -57,6 +57,8 @@ def test_a_loop_of_trainings_that_continue_each_other_is_not_told_to_change_what
     # A training that begins anew is judged alone
     with pytest.warns(UserWarning, match=r"Nothing is learnt: .* a smaller `learning_starts`, such as"):
         model.learn(n_steps)
+    with pytest.warns(UserWarning, match="Nothing is learnt yet: "):
+        model.learn(n_steps, reset_num_timesteps=False)
 
 
 def limited(length):

@@ -63,9 +63,7 @@ def test_a_population_and_an_agent_are_not_loaded_as_each_other(opened, tmp_path
     def saved(name):
         return io.BytesIO((tmp_path / f"{name}.zip").read_bytes()) if opened else tmp_path / name
 
-    with pytest.raises(
-        ValueError, match=r"the file of a population.* must be of CGP, .*`sb3_cgp.population.Population.load"
-    ):
+    with pytest.raises(ValueError, match=r"the file of a population.* must be of CGP, .*`sb3_cgp.population.Population.load"):
         CGP.load(saved("population"), env=make_env(2))
     with pytest.raises(ValueError, match=r"the file of a single agent.* must be of Population, .*`CGP.load\(path\)`"):
         Population.load(saved("agent"), env=make_env(2))

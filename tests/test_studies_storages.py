@@ -1,6 +1,8 @@
 """Storages of studies: patience with a database that is away, those that are none, and Optuna's proxy."""
 
+import copy
 import os
+import pickle
 import signal
 import socket
 import subprocess
@@ -10,6 +12,7 @@ from functools import partial
 from multiprocessing import get_context
 
 import grpc
+import optuna
 import pytest
 from filelock import FileLock
 from ledgers import forked
@@ -112,6 +115,13 @@ def test_the_reason_of_an_error_without_a_text_is_its_class():
 def test_a_command_that_ends_blames_the_storage_for_its_own_errors_only(error, message):
     with pytest.raises(SystemExit, match=message), errors_in_words():
         raise error
+
+
+@pytest.mark.parametrize("copier", [copy.deepcopy, lambda study: pickle.loads(pickle.dumps(study))])
+def test_a_study_can_be_copied(copier, tmp_path):
+    study = optuna.create_study(storage=open_storage(f"sqlite:///{tmp_path / 'studies.db'}"), study_name="study")
+    study.tell(study.ask(), 1.0)
+    assert copier(study).best_value == 1.0
 
 
 def test_no_patience_with_other_errors(clock):

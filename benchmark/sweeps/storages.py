@@ -231,4 +231,7 @@ class _Patient:
         self._storage = storage
 
     def __getattr__(self, name: str) -> Any:
+        # A copy has no storage yet when it is asked for its own methods
+        if name.startswith("_"):
+            raise AttributeError(name)
         return partial(patiently, getattr(self._storage, name))

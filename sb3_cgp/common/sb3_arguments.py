@@ -78,7 +78,7 @@ def check_learning_rate(name: str, value: Any) -> None:
         for progress_remaining in (1.0, 0.5, 0.0):
             try:
                 rate = value(progress_remaining)
-            except ArithmeticError as error:
+            except Exception as error:
                 allowed = f"a schedule of numbers from 1.0 to 0.0; at {progress_remaining} it raises {error!r}"
                 raise ValueError(f"The value of `{name}` is {value!r}, but must be {allowed}.") from error
             # As SB3 does, which takes an array or a tensor of one number too

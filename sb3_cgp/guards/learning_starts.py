@@ -47,6 +47,7 @@ class LearningStartsGuard(OffPolicyAlgorithm):
     def _announce_warm_up(self, total_timesteps: int, continues: bool) -> None:
         """Print how many steps are random, and warn if a training to ``total_timesteps`` will take no gradient step."""
         self._continues = continues
+        self._has_said_not_yet &= continues
         if self.num_timesteps < total_timesteps:
             self._print_warm_up(total_timesteps)
             last_timestep = self._last_timestep(total_timesteps)
