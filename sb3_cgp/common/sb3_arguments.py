@@ -80,7 +80,7 @@ def check_learning_rate(name: str, value: Any) -> None:
                 rate = value(progress_remaining)
             except Exception as error:
                 allowed = f"a schedule of numbers from 1.0 to 0.0; at {progress_remaining} it raises {error!r}"
-                raise ValueError(f"The value of `{name}` is {value!r}, but must be {allowed}.") from error
+                require(False, name, value, allowed)
             # As SB3 does, which takes an array or a tensor of one number too
             is_single = isinstance(rate, np.ndarray | th.Tensor) and math.prod(rate.shape) == 1
             require_number(f"{name}({progress_remaining})", rate.item() if is_single else rate)
