@@ -10,6 +10,7 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_cgp import CGP
 from sb3_cgp.guards import GuardedAlgorithm
 
 SMALL = dict(learning_starts=6, batch_size=8, buffer_size=1000, policy_kwargs=dict(net_arch=[4]), seed=0, device="cpu")
@@ -29,6 +30,11 @@ IGNORED_WARNINGS = [
     pytest.mark.filterwarnings("ignore:Nothing is learnt"),
     pytest.mark.filterwarnings("ignore:Evaluation environment is not wrapped"),
 ]
+
+
+def make(policy="MlpPolicy", env="Pendulum-v1", algorithm=CGP, **arguments):
+    """A small model, of CGP unless said otherwise."""
+    return algorithm(policy, env, **SMALL | arguments)
 
 
 class GuardedTD3(GuardedAlgorithm, TD3):
