@@ -84,12 +84,12 @@ def test_the_core_trains_alone_as_the_whole_package_does(tmp_path):
         alone = th.load(tmp_path / f"{variant}.pt")
         assert alone, variant
 
-        # With the core's own networks and scoring, the other packages change no bit
+        # With the core's own scoring, the other packages change no bit
         whole = CGP(policies.CGPPolicy, policy_kwargs=dict(net_arch=[16, 16]), **ARGUMENTS, **kwargs).learn(150)
         for name, value in alone.items():
             assert th.equal(whole.policy.state_dict()[name], value), f"{variant}: {name}"
 
-        # With the fast ones, values differ by rounding alone
+        # With the fast one, values differ by rounding alone
         fast = CGP("MlpPolicy", policy_kwargs=dict(net_arch=[16, 16]), cem_dtype="float32", **ARGUMENTS, **kwargs).learn(150)
         for name, value in alone.items():
             message = f"{variant}: {name}"

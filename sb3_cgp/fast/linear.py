@@ -10,19 +10,16 @@ from torch.nn import functional as F
 
 from sb3_cgp.fast.processor import is_intel
 
-# Number of multiplications above which oneDNN is faster despite the cost of its call
-MANY_MULTIPLICATIONS = 2**21
-
-# Rows are few with at least this many outputs for each
-FEW_ROWS = 4
+# Number of multiplications from which on oneDNN is faster despite the cost of its call
+MANY_MULTIPLICATIONS = 2**24
 
 
 def onednn_linear(dtype: th.dtype) -> Callable[..., th.Tensor] | None:
     """
     Return oneDNN's linear layer, a private operator of PyTorch that its compiler uses.
 
-    PyTorch's public linear layer calls MKL for float32, which has half oneDNN's speed on AMD's processors, and at least the
-    same on Intel's.
+    PyTorch's public linear layer calls MKL for float32, which on AMD's processors is slower, by 7 % to a half, depending on
+    the processor and the number of threads. On Intel's it is as fast.
 
     :param dtype: the data type
     :return: the operator; None if PyTorch's linear layer is as fast, if PyTorch has no such operator for this processor, or if
@@ -58,11 +55,7 @@ def multiply(inputs: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None
     if linear is None:
         return F.linear(inputs, weight, bias)
     # The operator could apply ReLU too, but that would turn NaN into zero
-    if inputs.shape[0] * FEW_ROWS > weight.shape[0]:
-        return linear(inputs, weight, bias, "none", [], "")
-    # oneDNN copies its second operand into its own memory layout: pass the smaller one
-    product = linear(weight, inputs, None, "none", [], "").t()
-    return product if bias is None else product.add_(bias)
+    return linear(inputs, weight, bias, "none", [], "")
 
 
 def is_linear(module: nn.Module) -> TypeGuard[nn.Linear]:

@@ -1,14 +1,12 @@
-"""CGP's policies with the fast networks and the fast scoring."""
+"""CGP's policies with the fast scoring."""
 
 from contextlib import nullcontext
 from itertools import chain
 from typing import Any
 
 import torch as th
-from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
-from stable_baselines3.td3.policies import Actor
 from torch import nn
 
 from sb3_cgp.common.networks import evaluation_mode
@@ -16,7 +14,6 @@ from sb3_cgp.common.rules import require_choice
 from sb3_cgp.core import policies as core_policies
 from sb3_cgp.core.cem import Score
 from sb3_cgp.fast.cuda_graphs import Function
-from sb3_cgp.fast.mlp import MLP
 from sb3_cgp.fast.scoring import SCORING_DTYPES, q_score, scoring_dtype
 from sb3_cgp.selectors import policies
 
@@ -56,32 +53,6 @@ class CGPPolicy(policies.CGPPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | dict(cem_dtype=self.cem_dtype)
-
-    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
-        """
-        Make TD3's actor, as an :class:`~sb3_cgp.fast.mlp.MLP`.
-
-        :param features_extractor: the features extractor; None for one of its own
-        :return: the actor
-        """
-        actor = super().make_actor(features_extractor)
-        actor.mu = MLP(*actor.mu)
-        return actor
-
-    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        """
-        Make TD3's critic, of :class:`~sb3_cgp.fast.mlp.MLP` networks.
-
-        :param features_extractor: the features extractor; None for one of its own
-        :return: the critic
-        """
-        critic = super().make_critic(features_extractor)
-        for index, q_network in enumerate(critic.q_networks):
-            assert isinstance(q_network, nn.Sequential)
-            critic.q_networks[index] = MLP(*q_network)
-            # SB3 registers each network under this name too, which is in `state_dict`
-            critic.add_module(f"qf{index}", critic.q_networks[index])
-        return critic
 
     def make_score(self, q_network: nn.Module, features: th.Tensor) -> Score:
         """

@@ -15,7 +15,6 @@ from torch.nn import functional as F
 from sb3_cgp.core.cem import Score
 from sb3_cgp.core.policies import repeated_q_score
 from sb3_cgp.fast.linear import is_hooked, is_linear, leading_relu_layers, multiply
-from sb3_cgp.fast.mlp import MLP
 from sb3_cgp.fast.processor import multiplies_bfloat16_faster
 
 SCORING_DTYPES = ("auto", "float32", "bfloat16")
@@ -222,9 +221,8 @@ def _is_relu_network(q_network: nn.Sequential) -> bool:
 
 
 def _starts_with_linear(q_network: nn.Module) -> TypeGuard[nn.Sequential]:
-    if not isinstance(q_network, nn.Sequential) or type(q_network) not in (nn.Sequential, MLP):
-        return False
-    if len(q_network) == 0 or not is_linear(q_network[0]):
+    # A subclass of Sequential could compute anything
+    if type(q_network) is not nn.Sequential or len(q_network) == 0 or not is_linear(q_network[0]):
         return False
     # Hooks of these modules would not be called; those of modules within them are
     return not any(map(is_hooked, (q_network, *q_network)))
