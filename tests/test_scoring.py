@@ -40,12 +40,6 @@ NETWORKS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _elsewhere_than_on_intel(monkeypatch):
-    """On Intel's processors oneDNN is not used for float32."""
-    monkeypatch.setattr(products, "is_intel", lambda: False)
-
-
 @pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize(("n_states", "n_actions"), [(1, 1), (5, 9), (64, 33)])
 @pytest.mark.parametrize("block_bytes", [1, 400, scoring.BLOCK_BYTES])
@@ -201,13 +195,6 @@ def test_auto_is_bfloat16_where_the_processor_multiplies_it_faster(monkeypatch, 
 def test_auto_is_float32_on_a_gpu(monkeypatch):
     monkeypatch.setattr(th.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
     assert scoring.scoring_dtype("auto", th.device("cuda")) == th.float32
-
-
-def test_on_intels_processors_float32_is_multiplied_by_pytorchs_linear_layer(monkeypatch):
-    elsewhere = products.onednn_linear(th.bfloat16)
-    monkeypatch.setattr(products, "is_intel", lambda: True)
-    assert products.onednn_linear(th.float32) is None
-    assert products.onednn_linear(th.bfloat16) is elsewhere
 
 
 @pytest.mark.parametrize("reason", ["no oneDNN", "no such function", "not on this processor"])

@@ -6,7 +6,7 @@ Shapes: B states, N actions per state, A action dimensions, F features, H units 
 
 import functools
 from collections.abc import Callable
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 import torch as th
 from torch import nn
@@ -15,7 +15,6 @@ from torch.nn import functional as F
 from sb3_cgp.core.cem import Score
 from sb3_cgp.core.policies import repeated_q_score
 from sb3_cgp.fast.linear import is_hooked, is_linear, leading_relu_layers, multiply
-from sb3_cgp.fast.processor import multiplies_bfloat16_faster
 
 SCORING_DTYPES = ("auto", "float32", "bfloat16")
 
@@ -54,8 +53,17 @@ def scoring_dtype(setting: str, device: th.device) -> th.dtype:
     :return: the data type
     """
     if setting == "auto":
-        return th.bfloat16 if device.type == "cpu" and multiplies_bfloat16_faster() else th.float32
+        return th.bfloat16 if device.type == "cpu" and _multiplies_bfloat16_faster() else th.float32
     return th.bfloat16 if setting == "bfloat16" else th.float32
+
+
+def _multiplies_bfloat16_faster() -> bool:
+    """Return whether the processor multiplies bfloat16 faster than float32; False where PyTorch does not know it."""
+    # Older versions of PyTorch lack this function
+    capabilities: dict[str, Any] = getattr(th.cpu, "get_capabilities", dict)()
+    # AVX-512 BF16 multiplies no faster on Intel's processors, which have AMX for this. Virtual machines may hide AMX.
+    is_intel = "Intel" in capabilities.get("cpu_name", "")
+    return bool(capabilities.get("amx_bf16") or (capabilities.get("avx512_bf16") and not is_intel))
 
 
 def q_score(q_network: nn.Module, features: th.Tensor, dtype: th.dtype = th.float32) -> Score:
