@@ -40,14 +40,15 @@ from sb3_cgp.guards.seeds import warning_of_missing_seed
 from sb3_cgp.guards.transitions import TransitionGuard
 from sb3_cgp.guards.workers import discard_replies, watching_workers
 
-SelfCommonGuards = TypeVar("SelfCommonGuards", bound="CommonGuards")
+SelfGuarded = TypeVar("SelfGuarded", bound="GuardedAlgorithm")
 
 
-class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
+class GuardedAlgorithm(TransitionGuard, EpisodeGuard, LearningStartsGuard, NormalisationGuard):
     """
-    The guards that populations have too, whose agents have tried their networks one by one, and no ``VecNormalize``.
+    An algorithm that notices faults of environments and wrong use, and names them or does the right thing.
 
-    Those that hold a state during a training are the base classes, which also override what SB3 does at each step.
+    It comes before an algorithm among a class's bases: ``class GuardedTD3(GuardedAlgorithm, TD3)``. Guards that hold a state
+    during a training are its own bases, which also override what SB3 does at each step.
     """
 
     # SB3 has no public method that `load`, `set_env` and the constructor share. Its method is a static one, which could not
@@ -58,6 +59,7 @@ class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
         wrapped = super()._wrap_env(maybe_make_env(env, verbose), verbose, monitor_wrapper)
         # Before SB3's assertions on the space
         check_action_space(wrapped.action_space)
+        check_wrappers(wrapped)
         return wrapped
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
@@ -79,6 +81,7 @@ class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
 
     def _try_networks(self) -> None:
         """Try the networks that have just been made."""
+        try_networks(self)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
@@ -93,7 +96,7 @@ class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
 
     @classmethod
     def load(
-        cls: type[SelfCommonGuards],
+        cls: type[SelfGuarded],
         path: str | pathlib.Path | io.BufferedIOBase,
         env: GymEnv | None = None,
         device: th.device | str = "auto",
@@ -101,7 +104,7 @@ class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
         print_system_info: bool = False,
         force_reset: bool = True,
         **kwargs: Any,
-    ) -> SelfCommonGuards:
+    ) -> SelfGuarded:
         """
         Load a model from a zip-file.
 
@@ -159,8 +162,8 @@ class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
             raise
 
     def learn(
-        self: SelfCommonGuards, total_timesteps: int, callback: Any = None, log_interval: Any = 4, *args: Any, **kwargs: Any
-    ) -> SelfCommonGuards:
+        self: SelfGuarded, total_timesteps: int, callback: Any = None, log_interval: Any = 4, *args: Any, **kwargs: Any
+    ) -> SelfGuarded:
         """
         Learn, if the arguments are right, and explain what fails.
 
@@ -206,20 +209,3 @@ class CommonGuards(TransitionGuard, EpisodeGuard, LearningStartsGuard):
         super()._update_current_progress_remaining(num_timesteps, total_timesteps)
         # The last rollout may end beyond the planned steps, where a schedule such as `2e-3 * remaining` is negative
         self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
-
-
-class GuardedAlgorithm(CommonGuards, NormalisationGuard):
-    """
-    An algorithm that notices faults of environments and wrong use, and names them or does the right thing.
-
-    It comes before an algorithm among a class's bases: ``class GuardedTD3(GuardedAlgorithm, TD3)``.
-    """
-
-    @classmethod
-    def _wrap_env(cls, env: GymEnv | str, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        wrapped = super()._wrap_env(env, verbose, monitor_wrapper)
-        check_wrappers(wrapped)
-        return wrapped
-
-    def _try_networks(self) -> None:
-        try_networks(self)

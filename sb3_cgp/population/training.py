@@ -12,14 +12,14 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_cgp.fast.cuda_graphs import RecordedFunction, Tensors, has_cuda_graphs
 from sb3_cgp.fast.recorded_optimizers import CHECK_INTERVAL, LOSSES
 from sb3_cgp.fast.replay_algorithm import LeanReplayAlgorithm
-from sb3_cgp.guards.algorithm import CommonGuards
+from sb3_cgp.guards.algorithm import GuardedAlgorithm
 from sb3_cgp.population.arguments import Arguments, value_of
 from sb3_cgp.population.gradient_step import AgentNumbers, GradientStep
 from sb3_cgp.population.policies import PopulationPolicy, SelectFunction
 from sb3_cgp.population.replay import sample_columns
 
 
-class PopulationTraining(CommonGuards, LeanReplayAlgorithm):
+class PopulationTraining(GuardedAlgorithm, LeanReplayAlgorithm):
     """
     The part of :class:`~sb3_cgp.population.algorithm.Population` that trains: what an agent does in ``core/cgp.py``, for all.
     """
@@ -66,6 +66,9 @@ class PopulationTraining(CommonGuards, LeanReplayAlgorithm):
     def failed(self) -> dict[int, str]:
         """The agents whose training has failed, and why. Their parameters do not change any more."""
         return {index: reason for index, reason in enumerate(self._failures) if reason is not None}
+
+    def _try_networks(self) -> None:
+        """Do nothing: the agents have tried their networks one by one."""
 
     def _learning_starts_of_agents(self) -> list[int]:
         return [int(number) for number in self._counts["learning_starts"]]
