@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch as th
 from environment_states import obstacles
-from filelock import FileLock
 from stable_baselines3 import TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback
@@ -26,7 +25,7 @@ from trainings import SMALL, Do, Interruption, Stop, make_model
 from sb3_cgp import CGP
 from sb3_cgp.common.files import write_atomically
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer
-from sb3_cgp.resumption import FolderInUseError, TrainingCheckpointCallback, locks, resumable
+from sb3_cgp.resumption import FolderInUseError, TrainingCheckpointCallback, resumable
 from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.replay_buffers import fill_replay_buffer, replay_buffer_state
 
@@ -86,9 +85,8 @@ def test_another_process_is_refused_and_a_killed_one_does_not_block(folder):
     CGP.resume(folder, env()).learn(40)
 
 
-# Versions of filelock without the option remove a copied file
-@pytest.mark.parametrize(("has_option", "is_copied"), [(True, True), (True, False), (False, False)])
-def test_on_a_file_system_without_locks_nothing_is_left_that_blocks(has_option, is_copied, tmp_path, monkeypatch):
+@pytest.mark.parametrize("is_copied", [True, False])
+def test_on_a_file_system_without_locks_nothing_is_left_that_blocks(is_copied, tmp_path, monkeypatch):
     def has_none(*_):
         raise OSError(errno.ENOSYS, "Function not implemented")
 
@@ -97,8 +95,6 @@ def test_on_a_file_system_without_locks_nothing_is_left_that_blocks(has_option, 
         gc.collect()
         assert (tmp_path / ".lock").exists()
     monkeypatch.setattr("fcntl.flock", has_none)
-    if not has_option:
-        monkeypatch.setattr(locks, "FileLock", lambda path, thread_local: FileLock(path, thread_local=thread_local))
     for _ in range(2):
         # A killed process releases nothing
         lock = FolderLock(tmp_path)

@@ -1,15 +1,13 @@
 """Locks on folders of training states and of runs: a folder belongs to one training at a time."""
 
 import gc
-import inspect
 import os
 import socket
 import warnings
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
-from filelock import FileLock, SoftFileLock, Timeout
+from filelock import FileLock, Timeout
 
 LOCK_FILE = ".lock"
 # Of a file of its own, as some versions of filelock truncate the file that they lock
@@ -33,11 +31,9 @@ class FolderLock:
     def __init__(self, folder: Path, name: str = LOCK_FILE):
         self.folder = folder
         self._owner_file = folder / f"{name}{OWNER_SUFFIX}"
-        # On a file system without locks, a file alone would be in the way of a resumption after a kill, and of a copied folder
-        has_option = "fallback_to_soft" in inspect.signature(FileLock).parameters
-        options: dict[str, Any] = {"fallback_to_soft": False} if has_option else {}
-        # A model may be deleted in another thread than the one that it was resumed in
-        self._lock = FileLock(folder / name, thread_local=False, **options)
+        # A model may be deleted in another thread than the one that it was resumed in. On a file system without locks, a file
+        # alone would be in the way of a resumption after a kill, and of a copied folder.
+        self._lock = FileLock(folder / name, thread_local=False, fallback_to_soft=False)
         self._process = os.getpid()
 
     @property
@@ -70,13 +66,9 @@ class FolderLock:
     def _acquire(self) -> None:
         try:
             self._lock.acquire(timeout=0)
-            # Versions of filelock before the option fall back to a file alone, too
-            if isinstance(self._lock, SoftFileLock):
-                self._lock.release(force=True)
-                raise NotImplementedError("its file system has no locks")
         except Timeout:
             raise
-        except (OSError, NotImplementedError) as error:
+        except OSError as error:
             if self.folder.is_dir() and os.access(self.folder, os.W_OK):
                 warnings.warn(
                     f"The folder {self.folder} cannot be locked ({error}): make sure that no other process uses it.",
