@@ -10,7 +10,6 @@ from trainings import Do, Interruption, parameters_equal
 
 from sb3_cgp import CGP, MlpPolicy
 from sb3_cgp.resumption import TrainingCheckpointCallback, resumable
-from sb3_cgp.resumption.state import gather
 from sb3_cgp.resumption.store import StateStore
 
 ARGUMENTS = dict(learning_starts=20, buffer_size=150, batch_size=8, seed=0, device="cpu")
@@ -86,17 +85,6 @@ def test_a_frozen_features_extractor_that_was_exchanged_is_resumed(tmp_path):
     straight = with_trained_extractors(make_model(CGP, **arguments)).learn(90)
     interrupted(with_trained_extractors(make_model(CGP, **arguments)), tmp_path)
     assert parameters_equal(CGP.resume(tmp_path, "Pendulum-v1").learn(90), straight)
-
-
-def test_a_state_of_an_earlier_version_is_resumed(tmp_path, monkeypatch):
-    def gather_as_before(*args):
-        state = gather(*args)
-        del state["frozen"]
-        return state
-
-    monkeypatch.setattr("sb3_cgp.resumption.callbacks.gather", gather_as_before)
-    interrupted(make_model(CGP), tmp_path)
-    assert parameters_equal(CGP.resume(tmp_path, "Pendulum-v1").learn(90), make_model(CGP).learn(90))
 
 
 OPTIMIZERS = {

@@ -26,7 +26,7 @@ from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback, checkpoints
 from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.logs import continued_logger
 from sb3_cgp.resumption.model import ResumableModel
-from sb3_cgp.resumption.parameters import freeze_parameters, frozen_parameters
+from sb3_cgp.resumption.parameters import freeze_parameters
 from sb3_cgp.resumption.progress_bars import show_whole_training
 from sb3_cgp.resumption.replay_buffers import fill_replay_buffer
 from sb3_cgp.resumption.state import begin_new_episode, check_fits
@@ -131,8 +131,7 @@ class ResumableAlgorithm(ResumableModel):
         model = cls.load(saved, cls._make_env(env, saved), device, force_reset=False, **kwargs)
         assert model.env is not None
         check_fits(model, state)
-        # States of earlier versions lack the entry
-        freeze_parameters(model.policy, state.get("frozen", frozen_parameters(model.policy)))
+        freeze_parameters(model.policy, state["frozen"])
         # Model and environment must share the space, as wrappers may draw random actions from it, too
         model.action_space = model.env.action_space
         changed = kwargs.get("replay_buffer_kwargs") or ()

@@ -198,8 +198,7 @@ def is_finished(folder: Path, args: argparse.Namespace, hyperparams: dict[str, A
     data, _, _ = load_from_zip_file(model, device="cpu")
     assert data is not None
     n_done = data["num_timesteps"]
-    # Models of earlier commits do not have it
-    has_ended = bool(data.get("_training_has_ended", n_done >= n_timesteps and not data["_policy_is_due"]))
+    has_ended = bool(data["_training_has_ended"])
     if not steps and not has_ended:
         raise FileNotFoundError(
             f"The run was interrupted at step {n_done:,} of {n_timesteps:,}, before it saved a state in {states}. {anew}"
