@@ -56,16 +56,14 @@ def open_ledger(args: argparse.Namespace) -> Ledger:
 
     :param args: the command line
     :return: the study
-    :raises ValueError: if an option is wrong, or the storage holds no such study, or one of an earlier version
+    :raises ValueError: if an option is wrong, or the storage holds no such study
     """
     check_grace(args.beat, args.grace)
     storage = patiently(open_storage, args.storage, create=False)
     names = optuna.get_all_study_names(storage)
     allowed = f"a study that benchmark.sweep has begun in this storage, which holds {', '.join(names) or 'none'}"
     require(args.study in names, "study", args.study, allowed)
-    ledger = Ledger(storage, args.study, args.grace)
-    ledger.refuse_unresolved()
-    return ledger
+    return Ledger(storage, args.study, args.grace)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

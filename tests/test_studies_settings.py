@@ -9,13 +9,10 @@ from tunings import arguments, tuner_of
 
 from benchmark import tune
 from benchmark.sweeps.experiments import Sweep
-from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import KEY
 from benchmark.sweeps.sweep_files import SweepFile
 from benchmark.sweeps.validation import SweepError
-from benchmark.worker import open_ledger as open_ledger_of_worker
-from benchmark.worker import parse as parse_worker
 
 
 def test_a_study_is_not_opened_with_other_settings(ledger):
@@ -96,21 +93,6 @@ def test_an_entry_that_is_edited_in_between_is_refused(tmp_path, monkeypatch):
         ledger.open(sweep(0.6, 2), {"experiment": "tiny"})
     ledger.open(sweep(0.5, 2), {"experiment": "tiny"})
     assert {trial.user_attrs["run"]["hyperparams"]["gamma"] for trial in ledger.trials()} == {0.5}
-
-
-def test_runs_of_an_earlier_version_that_lack_their_entry_are_refused(tmp_path):
-    """They would take the entry that the YAML file has when they begin."""
-    url = f"sqlite:///{tmp_path}/studies.db"
-    ledger = open_ledger(open_storage(url), Clock())
-    trial = ledger.trials()[1]
-    ledger.storage.set_trial_user_attr(ledger._id(trial), "run", trial.user_attrs["run"] | {"tuned": True})
-    message = "'study': was begun by an earlier version, which did not record the entries of `tuned: true`.*--study"
-    with pytest.raises(SweepError, match=message):
-        open_ledger(ledger.storage, Clock())
-    with pytest.raises(SweepError, match=message):
-        open_ledger_of_worker(parse_worker(["--study", "study", "--storage", url, "--logs", str(tmp_path)]))
-    # Their records can be exported
-    assert len(ledger.description()["configurations"]) == 1
 
 
 def test_a_sweep_and_a_tuning_do_not_share_a_study(ledger):

@@ -106,7 +106,6 @@ class Sweep:
             seed,
             self.methods[method].algo,
             hyperparams,
-            False,
             file.steps,
             file.evaluation_interval,
             file.evaluation_episodes,

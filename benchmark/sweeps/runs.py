@@ -19,7 +19,6 @@ class Run:
     :param seed: the seed
     :param algo: the algorithm's name in rl_zoo3
     :param hyperparams: all hyperparameters that are not the algorithm's defaults, as in rl_zoo3's YAML files
-    :param tuned: False; True for a run of an earlier version whose hyperparameters lack those of the algorithm's YAML file
     :param steps: environment steps
     :param evaluation_interval: environment steps between two evaluations
     :param evaluation_episodes: episodes of each evaluation
@@ -33,7 +32,6 @@ class Run:
     seed: int
     algo: str
     hyperparams: Hyperparams
-    tuned: bool
     steps: int
     evaluation_interval: int
     evaluation_episodes: int

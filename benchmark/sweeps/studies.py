@@ -89,7 +89,6 @@ class Ledger(TrialWriter):
         attributes = self.storage.get_study_user_attrs(self.study_id)
         if TUNING in attributes:
             raise self._refusal("", "holds the trials of a tuning")
-        self.refuse_unresolved()
         self._distributions = distributions_of(sweep)
         self._check(runs, trials)
         # Other methods than those of the runs
@@ -101,15 +100,6 @@ class Ledger(TrialWriter):
         self.adopt(ended, runs)
         self.enqueue_missing(runs)
         self._record_commands(commands)
-
-    def refuse_unresolved(self) -> None:
-        """
-        Refuse a study with runs of an earlier version that would read hyperparameters from a YAML file when they begin.
-
-        :raises SweepError: if it has some
-        """
-        if any(trial.user_attrs[RUN]["tuned"] for trial in self.trials()):
-            raise self._refusal("", "was begun by an earlier version, which did not record the entries of `tuned: true`")
 
     def _check(self, runs: Sequence[Run], trials: Sequence[FrozenTrial]) -> None:
         # Optuna fixes the values that a study's parameters can have

@@ -86,7 +86,6 @@ class Tuning:
             seed,
             self.algo,
             self.entry(trial),
-            False,
             self.steps,
             self.evaluation_interval,
             self.evaluation_episodes,
