@@ -1,5 +1,6 @@
 """The locks on the folders of runs."""
 
+import errno
 import subprocess
 import sys
 import time
@@ -37,3 +38,14 @@ def test_a_process_says_once_for_whom_it_waits(tmp_path, capsys, is_held):
     with locked(folders):
         pass
     assert "Waiting" not in capsys.readouterr().out
+
+
+def test_on_a_file_system_without_locks_nobody_waits(tmp_path, monkeypatch):
+    def has_none(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr("fcntl.flock", has_none)
+    monkeypatch.setattr("builtins.print", lambda *_, **__: pytest.fail("waits"))
+    # Two at once, as after a process that was killed
+    with locked([tmp_path]), locked([tmp_path]):
+        pass

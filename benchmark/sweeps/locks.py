@@ -10,7 +10,7 @@ from filelock import FileLock, Timeout
 @contextmanager
 def locked(folders: Sequence[Path]) -> Iterator[None]:
     """
-    Lock folders within a ``with`` block, and say for which process it waits.
+    Lock folders within a ``with`` block, and say for which process it waits. A file system may have no locks.
 
     :param folders: the folders, which are created
     """
@@ -19,12 +19,16 @@ def locked(folders: Sequence[Path]) -> Iterator[None]:
         for folder in sorted(folders):
             folder.mkdir(parents=True, exist_ok=True)
             path = folder / ".lock"
-            lock = FileLock(path)
+            # A file alone would remain where a process is killed, and all others would wait for it
+            lock = FileLock(path, fallback_to_soft=False)
             try:
                 lock.acquire(timeout=0)
             except Timeout:
                 told = f"Waiting for the process that holds {path}, which may be suspended: `fuser {path}` names it"
                 print(told, flush=True)
                 lock.acquire()
+            except OSError:
+                # A file system without locks
+                continue
             stack.callback(lock.release)
         yield

@@ -126,8 +126,8 @@ def _open_sqlite(database: URL) -> RDBStorage:
     with ExitStack() as stack:
         if not patiently(_has_tables, database, patience=0.0):
             # On a file system without locks, processes collide, and repeat what has failed
-            with suppress(OSError, NotImplementedError):
-                stack.enter_context(FileLock(f"{path}.lock", timeout=SQLITE_TIMEOUT))
+            with suppress(OSError):
+                stack.enter_context(FileLock(f"{path}.lock", timeout=SQLITE_TIMEOUT, fallback_to_soft=False))
         storage = _open_database(database, {"connect_args": {"timeout": SQLITE_TIMEOUT}})
     _make_transactions_exclusive(storage)
     return storage
