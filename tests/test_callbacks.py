@@ -143,13 +143,15 @@ def test_a_model_without_an_environment_is_refused_before_it_trains_its_policy(t
     assert all(before[name].equal(value) for name, value in model.policy.state_dict().items())
 
 
-def test_tensorboard_goes_on_in_the_trainings_own_folder(tmp_path):
+# A state of the last step that was written, and one before it, whose step is written again
+@pytest.mark.parametrize("save_freq", [25, 60])
+def test_tensorboard_goes_on_in_the_trainings_own_folder(tmp_path, save_freq):
     logs = str(tmp_path / "logs")
     arguments = dict(env="Pendulum-v1", tensorboard_log=logs)
     make_model(**arguments).learn(100, log_interval=1)
     stop = Do(86, lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        make_model(**arguments).learn(100, [TrainingCheckpointCallback(26, tmp_path / "state"), stop], log_interval=1)
+        make_model(**arguments).learn(100, [TrainingCheckpointCallback(save_freq, tmp_path / "state"), stop], log_interval=1)
     # The newest folder is another's
     make_model(**arguments).learn(30)
     # TensorBoard puts a folder's files into the order of the second in their names

@@ -90,6 +90,20 @@ def test_a_nan_in_the_offline_training_is_raised_at_once(stand_in):
         model.train_policy(max_steps=5)
 
 
+def test_the_offline_training_takes_its_steps_after_a_recorded_one_was_skipped(stand_in):
+    model = make_model().learn(60)
+    observations = model.replay_buffer.observations.copy()
+    model.replay_buffer.observations[:] = np.nan
+    model.train(1, 16)
+    with pytest.raises(ValueError, match="loss was NaN or infinite at gradient step 31"):
+        model.dump_logs()
+    model.replay_buffer.observations[:] = observations
+    before = [parameter.clone() for parameter in model.actor.parameters()]
+    with pytest.warns(UserWarning, match="has not reached a plateau"):
+        model.train_policy(max_steps=1)
+    assert not any(map(th.equal, before, model.actor.parameters()))
+
+
 def test_the_watch_remembers_the_first_bad_step_of_each_loss():
     watch = LossWatch(("critic", "actor"), n_updates=10, device=th.device("cpu"))
     seen = []

@@ -65,20 +65,12 @@ def test_every_combination_of_what_is_due_is_recorded_once_and_acting_too(stand_
     assert StandIn.made == 4 + 1
 
 
-def change_gamma(model):
-    model.gamma = 0.5
-
-
 def change_selector(model):
     model.policy.selector = CEM(2, 8, 3)
 
 
 def change_selector_in_place(model):
     model.policy.selector.elites = 3
-
-
-def change_batch_size(model):
-    model.batch_size = 5
 
 
 def freeze_a_layer(model):
@@ -90,10 +82,33 @@ def change_weight_decay(model):
         group["weight_decay"] = 0.1
 
 
-CHANGES = [change_gamma, change_selector, change_selector_in_place, change_batch_size, freeze_a_layer, change_weight_decay]
+def setting(**values):
+    """Set attributes of the model, as a callback may."""
+
+    def change(model):
+        for name, value in values.items():
+            setattr(model, name, value)
+
+    return change
 
 
-@pytest.mark.parametrize("change", CHANGES)
+CHANGES = {
+    "gamma": setting(gamma=0.5),
+    "tau": setting(tau=0.5),
+    "noise": setting(target_policy_noise=0.4),
+    "clip": setting(target_noise_clip=0.05),
+    "loss": setting(policy_loss="qgp"),
+    "batch size": setting(batch_size=5),
+    "data type": setting(cem_dtype="bfloat16"),
+    "proposals": lambda model: setattr(model.policy, "actor_proposes", False),
+    "selector": change_selector,
+    "selector in place": change_selector_in_place,
+    "frozen layer": freeze_a_layer,
+    "weight decay": change_weight_decay,
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 def test_a_changed_setting_is_recorded_anew(stand_in, change):
     model = make_model(target_update_interval=1).learn(60)
     assert StandIn.made == 2

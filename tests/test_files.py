@@ -11,7 +11,7 @@ import pytest
 
 from benchmark.common.tables import markdown_table
 from sb3_cgp import CGP
-from sb3_cgp.common.files import write_atomically
+from sb3_cgp.common.files import replace_all, write_atomically
 
 
 def test_markdown_table_lines_up():
@@ -73,3 +73,17 @@ def test_a_file_system_that_flushes_no_folders_is_no_error(
     with pytest.raises(OSError, match=str(tmp_path)) if is_passed_on else nullcontext():
         write_atomically(tmp_path / "file", b"content")
     assert (tmp_path / "file").read_bytes() == b"content"
+
+
+def test_files_of_a_folder_keep_their_permissions_and_links(tmp_path: Path) -> None:
+    """As an export that is written anew, for a robot's account that may read it and no more."""
+    folder, elsewhere = tmp_path / "folder", tmp_path / "elsewhere"
+    folder.mkdir()
+    for path, mode in ((folder / "plain", 0o604), (elsewhere, 0o640)):
+        path.write_bytes(b"old")
+        path.chmod(mode)
+    (folder / "linked").symlink_to(elsewhere)
+    replace_all(folder, {"plain": b"new", "linked": b"newer"})
+    assert (folder / "linked").is_symlink()
+    assert ((folder / "plain").read_bytes(), elsewhere.read_bytes()) == (b"new", b"newer")
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (folder / "plain", elsewhere)] == [0o604, 0o640]

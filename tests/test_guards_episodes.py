@@ -17,6 +17,7 @@ from guarded import (
 )
 from stable_baselines3 import TD3
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from trainings import Do
@@ -188,3 +189,30 @@ def test_a_training_in_two_parts_is_the_same_as_in_one(kind, n_envs, normalises,
     for name in ("rewards", "dones", "timeouts", "actions"):
         np.testing.assert_array_equal(*(getattr(buffer, name) for buffer in buffers), err_msg=name)
     assert buffers[0].dones.sum() == 40 // n_envs // 7 * n_envs
+
+
+class Correlated(OrnsteinUhlenbeckActionNoise):
+    """Counts how often an episode of it begins."""
+
+    n_episodes = 0
+
+    def reset(self):
+        super().reset()
+        self.n_episodes += 1
+
+
+def test_noise_begins_anew_with_an_episode_that_begins_because_the_environment_was_moved():
+    noise = Correlated(np.zeros(1), np.ones(1))
+    model = make_model("plain", action_noise=noise)
+    noise.n_episodes = 0
+    model.learn(6, Do(3, lambda: model.get_env().reset()))
+    # At the start of the training, and after the reset; none of the episodes of 7 steps ends
+    assert noise.n_episodes == 2
+
+
+def test_each_training_says_anew_that_its_environment_was_moved():
+    model = make_model("plain")
+    for _ in range(2):
+        with pytest.warns(UserWarning, match="was reset or stepped outside of this training") as warned:
+            model.learn(6, [Do(step, lambda: model.get_env().reset()) for step in (2, 4)], reset_num_timesteps=False)
+        assert len([each for each in warned if "outside of this training" in str(each.message)]) == 1

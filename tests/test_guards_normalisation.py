@@ -5,7 +5,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from guarded import ACTIONS, SMALL, GuardedTD3, Located, located
+from guarded import ACTIONS, SMALL, GuardedTD3, Located, located, make
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -15,6 +15,8 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
     VecTransposeImage,
 )
+
+from sb3_cgp import CGP
 
 FORGOTTEN = (
     r"`env` is .* must normalise observations, .* `load\(path, env=VecNormalize.load\(statistics, env\)\)`, or `set_env`"
@@ -185,3 +187,12 @@ def test_a_wrapper_that_changes_values_after_normalisation_is_noticed():
     with pytest.raises(ValueError, match="not those that VecNormalize returned"):
         model.learn(20)
     make_model(VecNormalize(Negated(located()))).learn(20)
+
+
+def test_a_policy_is_not_trained_on_observations_that_are_no_longer_normalised(tmp_path):
+    model = make("MlpPolicy", VecNormalize(located())).learn(20)
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = CGP.load(saved(model, tmp_path))
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    with pytest.raises(ValueError, match=FORGOTTEN):
+        loaded.train_policy(3)

@@ -153,8 +153,9 @@ def test_states_load_into_each_kind_of_buffer_and_other_sizes(saved, there, coun
     buffer = make_buffer(there, size)
     fill_replay_buffer(buffer, replay_buffer_state(add(make_buffer(saved), count)))
     assert (buffer.size(), buffer.buffer_size) == (min(count, 20), size)
-    expected = np.arange(max(count - 20, 0), count)
-    assert np.array_equal(np.sort(th.as_tensor(buffer.rewards).numpy().ravel()[: buffer.size()]), expected)
+    # From the oldest row, which the next one replaces in a full buffer, to the newest, which it continues
+    in_order = np.roll(th.as_tensor(buffer.rewards).numpy().ravel(), -buffer.pos)[-buffer.size() :]
+    assert np.array_equal(in_order, np.arange(max(count - 20, 0), count))
     add(buffer, 1)
 
 

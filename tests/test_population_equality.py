@@ -165,3 +165,10 @@ def test_gradient_steps_follow_the_steps_of_one_environment():
     assert list(population._agent_updates) == [3 * 7, 3 * 7]
     alone = CGP("MlpPolicy", Pushed(), **population.agents[0], device="cpu").learn(38)
     assert alone._n_updates == 21
+
+
+def test_an_agent_without_a_seed_leaves_its_environment_the_one_that_it_has():
+    env = make_env(3)
+    env.seed(11)
+    population = make([dict(seed=None), dict(seed=3), dict(seed=None)], env=env)
+    assert population.get_env()._seeds == [11, 3, 13]

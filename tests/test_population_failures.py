@@ -80,3 +80,23 @@ def test_failures_outlive_saving(tmp_path):
     before = loaded[0].policy.state_dict()
     loaded.learn(2 * 60, reset_num_timesteps=False)
     assert all(th.equal(loaded[0].policy.state_dict()[name], value) for name, value in before.items())
+
+
+def test_a_state_is_saved_with_the_failures_that_the_host_has_not_read_yet():
+    """On a GPU they are read every hundred gradient steps."""
+    population = make(3).learn(3 * 30)
+    population.policy.failed_at[0, 1] = 5
+    with pytest.warns(UserWarning, match="Agent 1 has failed. The critic loss was NaN or infinite at gradient step 5"):
+        population._before_saving_state()
+    assert population.failed.keys() == {1}
+    assert population._agent_updates[1] == 5
+
+
+@pytest.mark.filterwarnings("ignore:Agent 1 has failed")
+def test_the_log_has_the_means_over_the_agents_that_have_not_failed():
+    population = make([dict(), dict(learning_rate=1e30), dict(learning_starts=1_000)]).learn(3 * 80)
+    population.train(1, 8)
+    losses = population._unlogged["critic_loss"].tolist()
+    assert not math.isfinite(losses[1])
+    population._record_losses()
+    assert population.logger.name_to_value["train/critic_loss"] == losses[0]

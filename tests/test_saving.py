@@ -32,6 +32,9 @@ def test_loading_changes_arguments_and_checks_them(tmp_path):
     assert CGP.load(tmp_path / "model", inference=None).policy.inference == "actor"
     # As rl_zoo3's enjoy does
     assert CGP.load(tmp_path / "model", custom_objects=dict(learning_rate=0.0, lr_schedule=lambda _: 0.0))
+    # The actor's own rate, where one is given beside it
+    rates = dict(learning_rate=0.0, actor_learning_rate=2e-3)
+    assert CGP.load(tmp_path / "model", custom_objects=rates).actor_lr_schedule(1.0) == 2e-3
 
 
 @pytest.mark.parametrize(
