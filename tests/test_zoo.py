@@ -70,7 +70,7 @@ def unregistered(monkeypatch):
     zoo.register()
     for registry in (utils.ALGOS, hyperparams_opt.HYPERPARAMS_SAMPLER, hyperparams_opt.HYPERPARAMS_CONVERTER):
         monkeypatch.delitem(registry, "cgp")
-    for name in ("__init__", "create_callbacks"):
+    for name in ("__init__", "create_callbacks", "_preprocess_hyperparams", "learn", "save_trained_model"):
         monkeypatch.setattr(ExperimentManager, name, getattr(ExperimentManager, name).__wrapped__)
 
 

@@ -54,7 +54,7 @@ class Tuning:
 
         :param trial: the trial, which stores them
         """
-        env = gym.make(self.task)
+        env = gym.make(self.task, **({**self.base, **self.fixed}.get("env_kwargs") or {}))
         n_actions = env.action_space.shape[0] if isinstance(env.action_space, spaces.Box) else 0
         env.close()
         uses_her = "HerReplayBuffer" in str(self.base.get("replay_buffer_class"))

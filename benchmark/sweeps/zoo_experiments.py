@@ -98,7 +98,8 @@ def _arguments(run: Run, folder: Path, device: str) -> argparse.Namespace:
         seed=run.seed,
         conf_file=str(conf_file),
         device=device,
-        env_kwargs={},
+        # `rl_zoo3.enjoy` takes those of the hyperparameters then
+        env_kwargs=None,
         eval_env_kwargs=None,
         eval_episodes=run.evaluation_episodes,
         eval_freq=run.evaluation_interval,

@@ -70,8 +70,8 @@ def register_search_space() -> None:
 
 def register_default_config() -> None:
     """
-    Make our ``cgp.yml`` the default of ``--conf-file``, save training states to ``state`` in the run's folder, and fill
-    TensorBoard's tab HParams.
+    Make our ``cgp.yml`` the default of ``--conf-file``, save training states to ``state`` in the run's folder, fill
+    TensorBoard's tab HParams, and evaluate with the ``env_kwargs`` of the hyperparameters.
 
     rl_zoo3 looks for default hyperparameters inside its own package only.
     """
@@ -109,7 +109,27 @@ def register_default_config() -> None:
         self.callbacks.sort(key=lambda callback: isinstance(callback, TrainingCheckpointCallback))
 
     ExperimentManager.create_callbacks = create_callbacks_with_folder  # type: ignore[method-assign]
+    evaluate_with_env_kwargs()
     hold_folders()
+
+
+def evaluate_with_env_kwargs() -> None:
+    """Let the evaluations of a run, by any algorithm, take the ``env_kwargs`` of its hyperparameters."""
+    from rl_zoo3.exp_manager import ExperimentManager
+
+    # Private, but the one method that reads the hyperparameters' `env_kwargs`
+    preprocess = ExperimentManager._preprocess_hyperparams
+
+    @functools.wraps(preprocess)
+    def preprocess_for_both(self: Any, hyperparams: dict[str, Any]) -> Any:
+        # As the constructor, which knows those of the command line alone, makes them without `eval_env_kwargs`
+        are_one = self.eval_env_kwargs is self.env_kwargs
+        preprocessed = preprocess(self, hyperparams)
+        if are_one:
+            self.eval_env_kwargs = self.env_kwargs
+        return preprocessed
+
+    ExperimentManager._preprocess_hyperparams = preprocess_for_both  # type: ignore[method-assign]
 
 
 def hold_folders() -> None:

@@ -73,9 +73,6 @@ class ResumedExperiment(ExperimentManager):
 
         :return: the hyperparameters, and again in an ordered dictionary
         """
-        # As in rl_zoo3
-        if "env_kwargs" in self.saved_hyperparams and self.env_kwargs and self._eval_env_kwargs_args is None:
-            self.eval_env_kwargs = self.saved_hyperparams["env_kwargs"]
         return dict(self.saved_hyperparams), OrderedDict(self.saved_hyperparams)
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
