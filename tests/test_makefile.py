@@ -119,9 +119,9 @@ def test_train_takes_the_settings_of_a_run(clone: Clone) -> None:
     ("params", "expected"), [("", "learning_starts:25"), ("batch_size:8 tau:1", "learning_starts:25 batch_size:8 tau:1")]
 )
 def test_the_planned_warm_up_is_a_hyperparameter_of_the_run(params: str, expected: str, clone: Clone) -> None:
-    calls, ended = clone.make("train", "STEPS=250", f"PARAMS={params}", "ARGS=--uuid", WARM_UP="learning_starts:25")
+    calls, ended = clone.make("train", "STEPS=250", f"PARAMS={params}", "ARGS=--track", WARM_UP="learning_starts:25")
     assert ended.returncode == 0, ended.stderr
-    assert starting(calls, "-m rl_zoo3.train")[0].endswith(f"--tensorboard-log logs/tensorboard -params {expected} --uuid")
+    assert starting(calls, "-m rl_zoo3.train")[0].endswith(f"--tensorboard-log logs/tensorboard -params {expected} --track")
 
 
 def test_settings_are_not_taken_from_the_environment(clone: Clone) -> None:

@@ -81,3 +81,53 @@ def test_the_plan_is_made_for_the_users_own_hyperparameters(capsys, tmp_path: Pa
     assert overrides == ["learning_starts:100"]
     plan.main(["--env", "Reacher-v5", "--folder", str(tmp_path), "--", "-conf", str(conf_file)])
     assert capsys.readouterr().out == "200 1\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--uuid"], "`--uuid` .*leave it out"),
+        (["-uuid"], "`--uuid` .*leave it out"),
+        (["-f", "other"], "`--log-folder other` .*give LOGS=other"),
+        (["-fother"], "`--log-folder other` .*give LOGS=other"),
+        # As rl_zoo3 reads it
+        (["--log-f=other"], "`--log-folder other` .*give LOGS=other"),
+        (["--save-freq", "10", "--algo", "sac"], "`--algo sac` .*give ALGO=sac"),
+        (["-params", "tau:1", "--env", "Reacher-v5"], "`--env Reacher-v5` .*give ENV=Reacher-v5"),
+        (["-optimize"], "`--optimize-hyperparameters` .*call rl_zoo3.train without make"),
+    ],
+)
+def test_a_run_that_would_not_be_found_at_its_end_is_refused_before_it_starts(options: list[str], named: str) -> None:
+    with pytest.raises(SystemExit, match=f"^Error: {named}"):
+        plan.main(["--", *options])
+
+
+def test_options_that_leave_the_run_where_it_is_are_passed_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = (
+        "--env-kwargs g:2.0 --eval-env-kwargs g:3.0 -P -tb tensorboard --log-interval 5 --optimization-log-path x -tags uuid"
+    )
+    plan.main(["--folder", str(tmp_path), "--steps", "20000", "--", *options.split()])
+    assert capsys.readouterr().out == "1000 1\n"
+
+
+@pytest.mark.parametrize("steps", [[], ["--steps", "100"]])
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (None, "cannot be read: No such file"),
+        ("Reacher-v5: {policy", "is no mapping of tasks to hyperparameters"),
+        ("", "is no mapping of tasks to hyperparameters"),
+        ("Reacher-v5: MlpPolicy", "is no mapping of tasks to hyperparameters"),
+        ("Pendulum-v1: {n_timesteps: 100}", "Hyperparameters not found for cgp-Reacher-v5"),
+        ("Reacher-v5: {policy: MlpPolicy}", "`n_timesteps` among the task's hyperparameters is None"),
+        ("Reacher-v5: {n_timesteps: many}", "`n_timesteps` among the task's hyperparameters is 'many'"),
+    ],
+)
+def test_a_file_of_hyperparameters_that_does_not_fit_is_named(
+    steps: list[str], text: str | None, problem: str, tmp_path: Path
+) -> None:
+    conf_file = tmp_path / "mine.yml"
+    if text is not None:
+        conf_file.write_text(text)
+    with pytest.raises(SystemExit, match=f"^Error: .*{problem}"):
+        plan.main(["--env", "Reacher-v5", *steps, "--", "-conf", str(conf_file)])

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import yaml
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
 
@@ -33,6 +34,9 @@ def read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str
             hyperparams, _ = manager.read_hyperparameters()
     except OSError as error:
         raise ValueError(f"The file of hyperparameters {conf_file} cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, AttributeError, TypeError) as error:
+        problem = "is no mapping of tasks to hyperparameters"
+        raise ValueError(f"The file of hyperparameters {conf_file} {problem}: {error}") from error
     return dict(hyperparams)
 
 
