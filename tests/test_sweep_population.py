@@ -18,6 +18,7 @@ from benchmark.sweeps.groups import Group
 from benchmark.sweeps.population_run import train_group
 from benchmark.sweeps.run import run_folder
 from sb3_cgp.population import ChunkedSubprocVecEnv
+from sb3_cgp.zoo.resumed_run import is_finished, read_run
 
 pytestmark = pytest.mark.usefixtures("short_final_evaluation", "short_episodes")
 
@@ -99,6 +100,12 @@ def test_a_population_of_one_run_is_the_run_alone(tmp_path, runs_of, algo, own):
     assert {str(path).partition("/")[0] for path in files[0] - files[1]} <= {"best_model.zip", "state", ".run-lock"}
     assert files[1] <= files[0]
     assert read_curve(folder).timesteps == read_curve(tmp_path / "alone").timesteps
+
+
+def test_a_run_that_a_population_has_trained_to_its_end_has_ended(tmp_path, runs_of, capsys):
+    _, _, folders = train_together(runs_of({"M": ("cgp", CEM)}), tmp_path, 70)
+    assert "was interrupted" not in capsys.readouterr().out
+    assert [is_finished(each, *read_run(each)) for each in folders] == [True, True]
 
 
 @pytest.mark.parametrize(

@@ -223,6 +223,11 @@ class Population(ResumableAlgorithm, PopulationMembers):
         """
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
+    def _make_agent(self, index: int) -> CGP:
+        agent = super()._make_agent(index)
+        agent._training_has_ended = self._training_has_ended
+        return agent
+
     def _train_policy(self, index: int) -> bool:
         is_trained = super()._train_policy(index)
         if is_trained:
