@@ -86,6 +86,9 @@ def _try_rewards(model: OffPolicyAlgorithm) -> None:
     )
 
 
+# Whoever loads a model to act may have switched gradients off
+@th.inference_mode(False)
+@th.enable_grad()
 def try_networks(model: OffPolicyAlgorithm) -> None:
     """
     Pass a batch of random observations through copies of a policy's networks, and back.
