@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Progr
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.utils import configure_logger
 
 from sb3_cgp.common.files import whole_file
@@ -239,6 +239,19 @@ class ResumableAlgorithm(ResumableModel):
     def learn(self: SelfResumableAlgorithm, *args: Any, **kwargs: Any) -> SelfResumableAlgorithm:
         """
         Train the model, or resume its interrupted training.
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """
+        Collect experiences, see SB3's method, after states have been restored and saved.
+
+        :param args: the arguments of SB3's method
+        :param kwargs: the same arguments by keyword
+        :return: the numbers of steps and episodes, and whether to go on
+        """
+        # Not by the callback's `on_rollout_start`, before which SB3 draws the noise of gSDE
+        for each in self._checkpoints():
+            each.begin_rollout()
+        return super().collect_rollouts(*args, **kwargs)
 
         :param args: the algorithm's own arguments
         :param kwargs: the algorithm's own arguments

@@ -21,7 +21,7 @@ class TrainingCheckpointCallback(BaseCallback):
     Save the complete training state periodically, and when the training ends, for :meth:`ResumableAlgorithm.resume`.
 
     SB3 calls ``on_step`` before it has stored the transition and taken the gradient steps. A state that is due is therefore
-    saved when the next rollout starts. A state is also saved at the end of a training without rollouts, such as CGP's
+    saved before the next rollout starts. A state is also saved at the end of a training without rollouts, such as CGP's
     offline training of a policy.
 
     On SIGTERM, which a cluster's scheduler sends, and on Ctrl-C, the state is saved when the next rollout would start. Then
@@ -108,7 +108,8 @@ class TrainingCheckpointCallback(BaseCallback):
         self._saving = [each for each in checkpoints_among(self._all_callbacks) if each.path is not None]
         self.signals.watch()
 
-    def _on_rollout_start(self) -> None:
+    def begin_rollout(self) -> None:
+        """Restore the state of a resumed training, or save the state if it is due, before anything of a rollout happens."""
         self._is_in_rollouts = True
         self._is_within_step = False
         self._note_callbacks()
