@@ -13,6 +13,8 @@ CHANGES = {
     "start": dict(cem_start="actor", cem_actor_std=0.1, cem_actor_fraction=0.75),
     "result": dict(cem_result="mean"),
     "loss": dict(policy_loss="qgp", policy_delay=2),
+    "discount": dict(gamma=0.5),
+    "returns": dict(n_steps=2),
 }
 
 
@@ -37,7 +39,8 @@ class Change(BaseCallback):
 @pytest.mark.parametrize("values", CHANGES.values(), ids=CHANGES)
 def test_a_change_has_an_effect_and_is_resumed(tmp_path, values):
     def train(steps, folder, **values):
-        return make_model().learn(steps, callback=[Change(**values), TrainingCheckpointCallback(40, tmp_path / folder)])
+        callbacks = [Change(**values), TrainingCheckpointCallback(40, tmp_path / folder)]
+        return make_model(n_steps=3).learn(steps, callbacks)
 
     straight = train(100, "straight", **values)
     assert not parameters_equal(straight, train(100, "unchanged"))

@@ -45,6 +45,14 @@ def parameters(model):
     return th.cat([parameter.flatten() for parameter in model.policy.parameters()])
 
 
+def test_gradient_steps_without_data_are_refused_with_the_remedy(tmp_path):
+    model = make_model("Pendulum-v1")
+    model.save(tmp_path / "model")
+    for each in (model, CGP.load(tmp_path / "model", "Pendulum-v1")):
+        with pytest.raises(ValueError, match=r"`replay_buffer` is .*, but must be filled, by `learn` or `load_replay_buffer`"):
+            each.train(3)
+
+
 def test_a_replay_of_mujoco_takes_half_the_memory_of_sb3s():
     def bytes_of(buffer):
         return buffer.observations.nbytes + buffer.next_observations.nbytes

@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cgp.common.replay_buffers import stores_as_given
+from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import replay_buffer_class_of
 from sb3_cgp.common.vec_normalize import normalises
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer, fits_device, leaves_room
@@ -130,12 +131,30 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
             elif normalises(self._vec_normalize_env) and stores_as_given(type(buffer)):
                 message = "The replay buffer stores observations in float32, and `env` normalises them now: those near their"
                 warnings.warn(f"{message} mean may lose their differences. Train a new model to keep these.", stacklevel=2)
-        buffer = self._ensure_replay_buffer()
+        self._ensure_replay_buffer()
+        self._set_n_step_returns()
+        return super()._setup_learn(*args, **kwargs)
+
+    def _set_n_step_returns(self) -> None:
+        """Give the model's ``n_steps`` and ``gamma`` to the buffer; a loaded one has those of the model that saved it."""
+        buffer = self.replay_buffer
         if self._chooses_n_step_returns(type(buffer)):
             assert isinstance(buffer, NStepReplayBuffer)
-            # A loaded buffer has those of the model that saved it
             buffer.n_steps, buffer.gamma = self.n_steps, self.gamma
-        return super()._setup_learn(*args, **kwargs)
+
+    def train(self, *args: Any, **kwargs: Any) -> None:
+        """
+        Do gradient steps, see the algorithm's method.
+
+        :param args: the algorithm's own arguments
+        :param kwargs: the algorithm's own arguments
+        :raises ValueError: if there is no data
+        """
+        is_filled = self.replay_buffer is not None and self.replay_buffer.size() > 0
+        require(is_filled, "replay_buffer", self.replay_buffer, "filled, by `learn` or `load_replay_buffer`")
+        # A callback may have changed them
+        self._set_n_step_returns()
+        super().train(*args, **kwargs)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """
