@@ -1,4 +1,4 @@
-"""Frozen parameters stay frozen in a resumed training, and no state is saved that the policy's optimizers cannot load."""
+"""Frozen parameters stay frozen in a resumed training; optimizers and schedules that `resume` cannot make are refused."""
 
 from copy import deepcopy
 
@@ -6,6 +6,7 @@ import pytest
 import torch as th
 from stable_baselines3 import DQN, SAC, TD3
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from trainings import Do, Interruption, parameters_equal
 
 from sb3_cgp import CGP, MlpPolicy
@@ -124,6 +125,45 @@ def test_an_optimizer_that_is_exchanged_within_the_training_is_refused_at_the_ne
         model.learn(90, [TrainingCheckpointCallback(20, tmp_path), Do(50, exchange)])
     assert StateStore(tmp_path).steps() == [20, 40]
     assert CGP.resume(tmp_path, "Pendulum-v1").learn(90).num_timesteps == 90
+
+
+SCHEDULES = {
+    "lr_schedule": (CGP, FloatSchedule(1e-5)),
+    "exploration_schedule": (resumable(DQN), LinearSchedule(0.5, 0.1, 1.0)),
+}
+
+
+@pytest.mark.parametrize("name", SCHEDULES)
+def test_a_schedule_that_is_set_on_the_model_is_refused_at_the_next_state_and_warned_of_in_a_saved_model(name, tmp_path):
+    algorithm, schedule = SCHEDULES[name]
+    model = make_model(algorithm, env="CartPole-v1" if algorithm is not CGP else "Pendulum-v1")
+    message = rf"`model.{name}` was set on the model, but .* makes it of `\w+`.* Give these to the constructor"
+    checkpoint = TrainingCheckpointCallback(20, tmp_path / "state")
+    with pytest.raises(ValueError, match=message):
+        model.learn(90, [checkpoint, Do(50, lambda: setattr(model, name, schedule))])
+    assert StateStore(tmp_path / "state").steps() == [20, 40]
+    with pytest.warns(UserWarning, match=message):
+        model.save(tmp_path / "model")
+
+
+def test_a_learning_rate_that_is_set_with_its_schedule_is_resumed(tmp_path):
+    """By SB3's private method."""
+
+    def slow_down(model):
+        model.learning_rate = 1e-5
+        model._setup_lr_schedule()
+
+    straight = make_model(CGP)
+    straight.learn(90, Do(30, lambda: slow_down(straight)))
+    stopped = make_model(CGP)
+    with pytest.raises(Interruption):
+        stopped.learn(
+            90, [TrainingCheckpointCallback(10, tmp_path), Do(30, lambda: slow_down(stopped)), Do(57, raise_interruption)]
+        )
+    resumed = CGP.resume(tmp_path, "Pendulum-v1").learn(90)
+    assert parameters_equal(resumed, straight)
+    # A copy has schedules of its own
+    deepcopy(resumed).learn(20, TrainingCheckpointCallback(20, tmp_path / "copy"))
 
 
 class OwnOptimizers(MlpPolicy):

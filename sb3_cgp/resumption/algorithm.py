@@ -4,6 +4,7 @@ import copy
 import io
 import os
 import signal
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,7 +27,7 @@ from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback, checkpoints
 from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.logs import continued_logger
 from sb3_cgp.resumption.model import ResumableModel
-from sb3_cgp.resumption.parameters import freeze_parameters
+from sb3_cgp.resumption.parameters import freeze_parameters, lost_schedule
 from sb3_cgp.resumption.progress_bars import show_whole_training
 from sb3_cgp.resumption.replay_buffers import fill_replay_buffer
 from sb3_cgp.resumption.state import begin_new_episode, check_fits
@@ -158,13 +159,16 @@ class ResumableAlgorithm(ResumableModel):
         """
         Save all the attributes of the object and the model parameters in a zip-file.
 
-        The file is written completely or not at all.
+        The file is written completely or not at all. A warning names a schedule that was set on the model, and is not saved.
 
         :param path: path to the file where the rl agent should be saved
         :param exclude: name of parameters that should be excluded in addition to the default ones
         :param include: name of parameters that might be excluded but should be included anyway
         :raises OSError: if it cannot be written; an existing file is then not changed
         """
+        lost = lost_schedule(self)
+        if lost is not None:
+            warnings.warn(lost, stacklevel=2)
         with _whole(path, ".zip") as file:
             super().save(file, exclude, include)
 
@@ -236,10 +240,6 @@ class ResumableAlgorithm(ResumableModel):
         self._note_training(callback=callback)
         return callback
 
-    def learn(self: SelfResumableAlgorithm, *args: Any, **kwargs: Any) -> SelfResumableAlgorithm:
-        """
-        Train the model, or resume its interrupted training.
-
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         """
         Collect experiences, see SB3's method, after states have been restored and saved.
@@ -252,6 +252,10 @@ class ResumableAlgorithm(ResumableModel):
         for each in self._checkpoints():
             each.begin_rollout()
         return super().collect_rollouts(*args, **kwargs)
+
+    def learn(self: SelfResumableAlgorithm, *args: Any, **kwargs: Any) -> SelfResumableAlgorithm:
+        """
+        Train the model, or resume its interrupted training.
 
         :param args: the algorithm's own arguments
         :param kwargs: the algorithm's own arguments

@@ -1,4 +1,4 @@
-"""What SB3's zip does not hold of a policy's parameters: which of them are frozen, and optimizers that were set on a model."""
+"""What SB3's zip does not hold of a training: which parameters are frozen, and optimizers and schedules set on a model."""
 
 from collections.abc import Collection
 from typing import Any
@@ -8,7 +8,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import recursive_getattr
 
 from sb3_cgp.common.random_state import preserved_random_state
-from sb3_cgp.resumption.model import ResumableModel
+from sb3_cgp.resumption.model import SCHEDULES, ResumableModel
 
 
 def frozen_parameters(policy: BasePolicy) -> list[str]:
@@ -32,13 +32,37 @@ def freeze_parameters(policy: BasePolicy, names: Collection[str]) -> None:
         parameter.requires_grad_(name not in names)
 
 
-def check_optimizers(model: ResumableModel) -> None:
+def lost_schedule(model: ResumableModel) -> str | None:
     """
-    Refuse an optimizer that was set on a model and is another one than that which ``resume`` makes. Check each of them once.
+    Say which schedule was set on a model, as SB3's ``load`` makes it anew of the arguments.
 
     :param model: the model
-    :raises ValueError: naming the optimizer, and the remedy
+    :return: a sentence with the remedy; None if no schedule is lost
     """
+    for name, arguments in SCHEDULES.items():
+        if vars(model).get(name) is not model._made_schedules.get(name):
+            return (
+                f"`model.{name}` was set on the model, but a model that is loaded or resumed makes it of {arguments}. Give "
+                "these to the constructor; a learning rate that changes is a function of the progress remaining, from 1 to 0."
+            )
+    return None
+
+
+def check_savable_training(model: ResumableModel) -> None:
+    """
+    Refuse what was set on a model and differs from what ``resume`` makes: schedules and optimizers.
+
+    :param model: the model
+    :raises ValueError: naming the schedule or the optimizer, and the remedy
+    """
+    lost = lost_schedule(model)
+    if lost is not None:
+        raise ValueError(lost)
+    _check_optimizers(model)
+
+
+def _check_optimizers(model: ResumableModel) -> None:
+    """Refuse an optimizer that was set on a model and is another one than that which ``resume`` makes. Check each once."""
     names = [name for name in model._get_torch_save_params()[0] if name.endswith(".optimizer")]
     optimizers = {name: recursive_getattr(model, name) for name in names}
     if optimizers == model._training.checked_optimizers:
