@@ -27,6 +27,7 @@ from sb3_cgp.guards.argument_names import suggests_names
 from sb3_cgp.guards.arguments import check_callback
 from sb3_cgp.guards.construction import checks_arguments
 from sb3_cgp.guards.explanations import explaining_errors
+from sb3_cgp.guards.gradients import check_actor_learns, check_gradients
 from sb3_cgp.guards.losses import LossGuard
 from sb3_cgp.guards.replay_buffer_fit import fit_replay_buffer
 from sb3_cgp.resumption.algorithm import ResumableAlgorithm
@@ -243,6 +244,8 @@ class CGP(
         :raises RuntimeError: if a worker process of a ``SubprocVecEnv`` has died
         :raises FolderInUseError: if a folder for training states is used by another training
         """
+        if self.policy_loss is not None and self.policy_training == "offline":
+            check_actor_learns(self.actor)
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     @suggests_names
@@ -270,14 +273,16 @@ class CGP(
         :param callback: callback(s) called at every gradient step; the training stops when one returns False
         :param progress_bar: Display a progress bar using tqdm and rich.
         :return: the model, whose ``predict`` then uses the network that ``inference`` names
-        :raises ValueError: if there is no policy loss or no data, if observations are not normalised and the critics have
-            learnt from normalised ones, or if a loss is NaN or infinite
+        :raises ValueError: if there is no policy loss or no data, if gradients are off or the actor is frozen, if observations
+            are not normalised and the critics have learnt from normalised ones, or if a loss is NaN or infinite
         """
         if self.resumption is not None:
             raise ValueError(
                 "A training state has been loaded by `resume`: call `learn`, which continues it, before `train_policy`."
             )
         check_callback("callback", callback)
+        check_gradients(self)
+        check_actor_learns(self.actor)
         with self.as_training(), explaining_errors(self):
             self._check_normalisation()
             fit_replay_buffer(self)

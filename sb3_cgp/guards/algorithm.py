@@ -29,6 +29,7 @@ from sb3_cgp.guards.file_names import find_file
 from sb3_cgp.guards.learning_starts import LearningStartsGuard
 from sb3_cgp.guards.networks import check_goals, check_observation_space, try_networks
 from sb3_cgp.guards.normalisation import NormalisationGuard, check_wrappers
+from sb3_cgp.guards.gradients import check_gradients
 from sb3_cgp.guards.replay_buffer_fit import (
     check_loaded_replay_buffer,
     check_replay_buffer,
@@ -174,12 +175,13 @@ class GuardedAlgorithm(TransitionGuard, EpisodeGuard, LearningStartsGuard, Norma
         :param kwargs: the algorithm's own arguments
         :return: the trained model
         :raises ValueError: naming the first argument that is wrong, its value and what is allowed, or the fault of an
-            environment
+            environment, or if gradients are off
         :raises RuntimeError: if a worker of a ``SubprocVecEnv`` has died; its environment is closed
         """
         total_timesteps = check_learn_arguments(self, total_timesteps, callback, log_interval)
         with (
             watching_workers(self),
+        check_gradients(self)
             explaining_errors(self),
             observing_environments(self),
             self._expecting_gradient_steps(),
