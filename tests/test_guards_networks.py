@@ -122,6 +122,27 @@ def test_an_actor_that_is_frozen_stays_and_the_critics_learn(arguments):
     assert not th.equal(model.actor.mu[2].bias, before["actor.mu.2.bias"])
 
 
+class Lazy(BaseFeaturesExtractor):
+    def __init__(self, observation_space, is_initialised=False):
+        super().__init__(observation_space, 3)
+        self.layer = nn.LazyLinear(3)
+        if is_initialised:
+            self.layer(th.zeros(1, *observation_space.shape))
+
+    def forward(self, observations):
+        return self.layer(observations)
+
+
+@pytest.mark.parametrize("is_shared", [False, True])
+def test_lazy_layers_are_refused_unless_they_are_initialised(is_shared):
+    kwargs = dict(net_arch=[4], features_extractor_class=Lazy, share_features_extractor=is_shared)
+    message = r"`policy.actor.features_extractor.layer.weight` is .*, but must be initialised .* `nn.Linear\(n, 8\)` for"
+    with pytest.raises(ValueError, match=message):
+        make_model(algorithm=CGP, policy_kwargs=kwargs)
+    kwargs["features_extractor_kwargs"] = dict(is_initialised=True)
+    assert make_model(algorithm=CGP, policy_kwargs=kwargs).learn(20)._n_updates > 0
+
+
 @pytest.mark.parametrize("algorithm", [TD3, CGP])
 def test_a_critic_that_is_frozen_ends_the_training_as_in_sb3(algorithm):
     model = algorithm("MlpPolicy", located(), **SMALL)

@@ -12,6 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_action_dim, get_obs_shape
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+from torch.nn.parameter import is_lazy
 
 from sb3_cgp.common.random_state import preserved_random_state
 from sb3_cgp.common.rules import require
@@ -97,11 +98,12 @@ def try_networks(model: OffPolicyAlgorithm) -> None:
     a policy that cannot be copied, are not tried.
 
     :param model: the model, its networks made
-    :raises ValueError: if a network fails or returns a wrong shape, naming the network and the observation space, or if the
-        selector would choose actions by other values than the critic learns
+    :raises ValueError: if a parameter is not initialised, if a network fails or returns a wrong shape, naming the network and
+        the observation space, or if the selector would choose actions by other values than the critic learns
     """
     if not (hasattr(model.policy, "actor") and hasattr(model.policy, "critic")):
         return
+    _check_initialised(model.policy)
     try:
         policy: Any = copy.deepcopy(model.policy)
     except Exception:
@@ -121,6 +123,16 @@ def try_networks(model: OffPolicyAlgorithm) -> None:
 
 def _try_on(policy: Any, model: OffPolicyAlgorithm, is_random: bool) -> Any:
     """Try a copied policy on a batch of random observations, or of zeros where the space has them, and return the batch."""
+def _check_initialised(policy: th.nn.Module) -> None:
+    """Refuse parameters of lazy modules, of which each network and its target would make others at their first call."""
+    for name, parameter in policy.named_parameters():
+        allowed = (
+            "initialised when the model is made: give its module the sizes, as in `nn.Linear(n, 8)` for `nn.LazyLinear(8)`, "
+            "or pass an observation through the features extractor in its constructor"
+        )
+        require(not is_lazy(parameter), f"policy.{name}", parameter, allowed)
+
+
     batch_size = min(model.batch_size, 3)
     observations = _make_observations(model.observation_space, batch_size, model.device, is_random)
     actions = th.zeros(batch_size, get_action_dim(model.action_space), device=model.device)
