@@ -13,6 +13,7 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+from trainings import Do
 
 from sb3_cgp import CGP
 from sb3_cgp.common.spaces import check_action_space
@@ -57,6 +58,18 @@ def test_noise_of_another_shape_than_the_actions_is_refused(n_envs):
     model.action_noise = noise
     with pytest.raises(ValueError, match=message):
         model.learn(12)
+
+
+@pytest.mark.parametrize("algorithm", [GuardedTD3, CGP])
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_noise_that_a_callback_sets_is_that_of_the_next_steps(algorithm, n_envs):
+    model = algorithm("MlpPolicy", located(n_envs), **SMALL)
+    model.learn(60, Do(5, lambda: setattr(model, "action_noise", normal(0.0))))
+    assert isinstance(model.action_noise, VectorizedActionNoise) == (n_envs > 1)
+    model = algorithm("MlpPolicy", located(n_envs), **SMALL)
+    with pytest.raises(ValueError, match=r"`action_noise` is .*, but must be noise .* shape, \(1,\), not \(3,\)"):
+        model.learn(60, Do(5, lambda: setattr(model, "action_noise", NormalActionNoise(np.zeros(3), np.ones(3)))))
+    assert model.num_timesteps == 5 * n_envs
 
 
 @pytest.mark.parametrize(

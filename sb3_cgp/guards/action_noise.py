@@ -13,15 +13,16 @@ from sb3_cgp.common.rules import require
 
 def fit_action_noise(model: OffPolicyAlgorithm) -> None:
     """
-    Adapt vectorised action noise to the number of environments, which `load` may have changed.
+    Adapt action noise to the number of environments, which `load` may have changed, or for which a callback did not set it.
 
     :param model: the model, with an environment
     """
     assert model.env is not None
     noise, n_envs = model.action_noise, model.env.num_envs
-    if not isinstance(noise, VectorizedActionNoise) or len(noise.noises) == n_envs:
+    is_vectorized = isinstance(noise, VectorizedActionNoise)
+    if noise is None or n_envs == (len(noise.noises) if is_vectorized else 1):
         return
-    base = copy.deepcopy(noise.base_noise)
+    base = copy.deepcopy(noise.base_noise if is_vectorized else noise)
     model.action_noise = base if n_envs == 1 else VectorizedActionNoise(base, n_envs)
 
 

@@ -11,8 +11,11 @@ from typing import Any, TypeVar
 
 import torch as th
 from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cgp.common.load_arguments import saved_attributes
@@ -26,10 +29,10 @@ from sb3_cgp.guards.dummy_vec_env import observing_environments
 from sb3_cgp.guards.episodes import EpisodeGuard
 from sb3_cgp.guards.explanations import explaining_errors
 from sb3_cgp.guards.file_names import find_file
+from sb3_cgp.guards.gradients import check_gradients
 from sb3_cgp.guards.learning_starts import LearningStartsGuard
 from sb3_cgp.guards.networks import check_goals, check_observation_space, try_networks
 from sb3_cgp.guards.normalisation import NormalisationGuard, check_wrappers
-from sb3_cgp.guards.gradients import check_gradients
 from sb3_cgp.guards.replay_buffer_fit import (
     check_loaded_replay_buffer,
     check_replay_buffer,
@@ -178,10 +181,10 @@ class GuardedAlgorithm(TransitionGuard, EpisodeGuard, LearningStartsGuard, Norma
             environment, or if gradients are off
         :raises RuntimeError: if a worker of a ``SubprocVecEnv`` has died; its environment is closed
         """
+        check_gradients(self)
         total_timesteps = check_learn_arguments(self, total_timesteps, callback, log_interval)
         with (
             watching_workers(self),
-        check_gradients(self)
             explaining_errors(self),
             observing_environments(self),
             self._expecting_gradient_steps(),
@@ -194,8 +197,7 @@ class GuardedAlgorithm(TransitionGuard, EpisodeGuard, LearningStartsGuard, Norma
         discard_replies(self.env)
         allowed = f"an environment: `{type(self).__name__}.load(path, env)`, or `set_env` before `learn`"
         require(self.env is not None, "env", self.env, allowed)
-        fit_action_noise(self)
-        check_action_noise(self.action_noise, self.action_space)
+        self._fit_action_noise()
         if self.replay_buffer is not None:
             check_replay_buffer(self.replay_buffer, self)
             check_contents(self.replay_buffer)
@@ -206,6 +208,37 @@ class GuardedAlgorithm(TransitionGuard, EpisodeGuard, LearningStartsGuard, Norma
         self._begin_checks()
         fit_replay_buffer(self)
         return result
+
+    def _fit_action_noise(self) -> None:
+        check_action_noise(self.action_noise, self.action_space)
+        fit_action_noise(self)
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        train_freq: TrainFreq,
+        replay_buffer: ReplayBuffer,
+        action_noise: ActionNoise | None = None,
+        *args: Any,
+        **kwargs: Any,
+    ) -> RolloutReturn:
+        """
+        Collect experiences and store them into the replay buffer, see SB3's method.
+
+        :param env: The training environment
+        :param callback: Callback that will be called at each step (and at the beginning and end of the rollout)
+        :param train_freq: How much experience to collect
+        :param replay_buffer: the replay buffer
+        :param action_noise: the model's action noise, which a callback may have set
+        :param args: the further arguments of SB3's method
+        :param kwargs: the further arguments of SB3's method
+        :return: the numbers of steps and episodes, and whether to go on
+        :raises ValueError: if the noise cannot be added to an action
+        """
+        if action_noise is not None:
+            self._fit_action_noise()
+        return super().collect_rollouts(env, callback, train_freq, replay_buffer, self.action_noise, *args, **kwargs)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         super()._update_current_progress_remaining(num_timesteps, total_timesteps)
