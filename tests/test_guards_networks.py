@@ -194,6 +194,23 @@ def test_a_scalar_observation_is_refused_with_the_remedy(space, name):
 
 
 @pytest.mark.parametrize(
+    ("space", "remedy"),
+    [
+        (spaces.Discrete(5, start=3), "with `start` 0, as SB3 encodes numbers from 0: subtract `start`"),
+        (spaces.Dict(a=spaces.MultiDiscrete([2, 3], start=[0, 1])), "with `start` 0"),
+        (spaces.MultiDiscrete([[2, 3], [4, 2]]), "of one axis, .*: flatten the space"),
+    ],
+    ids=str,
+)
+def test_a_discrete_observation_that_sb3_cannot_encode_is_refused_with_the_remedy(space, remedy):
+    env = Located()
+    env.observation_space = space
+    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
+    with pytest.raises(ValueError, match=rf"(?s)`observation_space.* is .*Discrete\(.*, but must be {remedy}"):
+        GuardedTD3(policy, DummyVecEnv([lambda: env]), **SMALL)
+
+
+@pytest.mark.parametrize(
     "space",
     [
         spaces.Box(-np.inf, np.inf, (2, 3), np.float64),

@@ -11,8 +11,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_cgp.guards.explanations import check_reset_info
+from sb3_cgp.guards.observation_fit import check_integers, check_shape
 from sb3_cgp.guards.observations import innermost
-from sb3_cgp.guards.transitions import check_final_observation, check_shape
+from sb3_cgp.guards.transitions import check_final_observation
 
 
 @contextmanager
@@ -20,12 +21,13 @@ def observing_environments(model: OffPolicyAlgorithm) -> Iterator[None]:
     """
     See the observations of a ``DummyVecEnv`` as its environments return them.
 
-    Those that NumPy would broadcast to the array in which a ``DummyVecEnv`` collects them are refused. An episode's final one
-    is checked before ``VecNormalize`` clips it, and copied before the environment's ``reset`` can overwrite it; the latter
-    not in a subclass with a ``step_wait`` that takes no environment from ``envs`` between its step and its reset.
+    Those that NumPy would broadcast to the array in which a ``DummyVecEnv`` collects them, or round or wrap to its integers,
+    are refused. An episode's final one is checked before ``VecNormalize`` clips it, and copied before the environment's
+    ``reset`` can overwrite it; the latter not in a subclass with a ``step_wait`` that takes no environment from ``envs``
+    between its step and its reset.
 
     :param model: the model that learns within the context
-    :raises ValueError: if an observation is of a wrong shape, or ``reset`` returns no dictionary beside it
+    :raises ValueError: if an observation does not fit its space, or ``reset`` returns no dictionary beside it
     """
     env = innermost(model.env)
     if not isinstance(env, DummyVecEnv):
@@ -61,14 +63,16 @@ class _ObservationObserver:
 
         :param env_idx: the environment's index
         :param obs: its observation
-        :raises ValueError: if it is of a wrong shape, or ``reset`` returns no dictionary beside it
+        :raises ValueError: if it does not fit its space, or ``reset`` returns no dictionary beside it
         """
         # Where a subclass of ``DummyVecEnv`` has not taken the environment from its list before its reset
         self.save_final(env_idx)
         model = None if self._model is None else self._model()
         if model is not None:
             check_reset_info(self._env.reset_infos[env_idx])
-            check_shape("observation", obs, self._env.observation_space, None, model.num_timesteps)
+            space = self._env.observation_space
+            check_shape("observation", obs, space, None, model.num_timesteps)
+            check_integers("observation", obs, space, model.num_timesteps)
         type(self._env)._save_obs(self._env, env_idx, obs)
 
     def save_final(self, env_idx: int) -> None:
@@ -78,7 +82,7 @@ class _ObservationObserver:
         ``VecNormalize`` would broadcast and clip that observation before any other check.
 
         :param env_idx: the environment's index
-        :raises ValueError: if the final observation is of a wrong shape, NaN or infinite
+        :raises ValueError: if the final observation does not fit its space, or is NaN or infinite
         """
         info = self._env.buf_infos[env_idx]
         final = info.get("terminal_observation")
@@ -94,6 +98,7 @@ class _ObservationObserver:
             check_final_observation(final, space, timestep)
         else:
             check_shape("terminal observation", final, space, None, timestep)
+        check_integers("terminal observation", final, space, timestep)
         self._seen[env_idx] = info["terminal_observation"] = copy.deepcopy(final)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 OLD_API = (
@@ -44,7 +44,7 @@ def explaining_errors(model: OffPolicyAlgorithm) -> Iterator[None]:
     """
     try:
         yield
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, KeyError) as error:
         message = explain(error, model)
         if message is None:
             raise
@@ -94,6 +94,10 @@ def explain(error: Exception, model: OffPolicyAlgorithm) -> str | None:
     :return: the cause and the remedy; None for an error that speaks for itself
     """
     *_, (frame, line_number) = traceback.walk_tb(error.__traceback__)
+    if isinstance(error, KeyError):
+        is_observation = frame.f_globals.get("__name__") == SubprocVecEnv.__module__
+        missing = f"An environment returned an observation without the key {error} of its space, at environment step"
+        return f"{missing} {model.num_timesteps}. It was not stored." if is_observation else None
     reward = _explain_reward(error, frame)
     if reward is not None:
         return f"The environment returned a reward that is not a number at environment step {model.num_timesteps}{reward}."

@@ -25,18 +25,20 @@ GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 def check_observation_space(space: spaces.Space) -> None:
     """
-    Refuse scalars, which neither SB3's replay buffer nor its ``CombinedExtractor`` takes.
+    Refuse scalars, which neither SB3's replay buffer nor its ``CombinedExtractor`` takes, and what SB3 cannot encode.
 
     :param space: the observation space
     :raises ValueError: naming the space, and the remedy
     """
     for key, subspace in by_key(space).items():
-        require(
-            not isinstance(subspace, spaces.Box) or subspace.shape != (),
-            "observation_space" if key is None else f"observation_space['{key}']",
-            subspace,
-            "of a shape with at least one axis, such as (1,): return `np.array([value])` from the environment",
-        )
+        name = "observation_space" if key is None else f"observation_space['{key}']"
+        allowed = "of a shape with at least one axis, such as (1,): return `np.array([value])` from the environment"
+        require(not isinstance(subspace, spaces.Box) or subspace.shape != (), name, subspace, allowed)
+        if isinstance(subspace, spaces.Discrete | spaces.MultiDiscrete):
+            allowed = "with `start` 0, as SB3 encodes numbers from 0: subtract `start` in the environment"
+            require(not np.any(subspace.start), name, subspace, allowed)
+            allowed = "of one axis, as SB3 encodes no others: flatten the space and the observations"
+            require(subspace.shape is not None and len(subspace.shape) <= 1, name, subspace, allowed)
 
 
 def check_goals(model: OffPolicyAlgorithm) -> None:
@@ -101,9 +103,9 @@ def try_networks(model: OffPolicyAlgorithm) -> None:
     :raises ValueError: if a parameter is not initialised, if a network fails or returns a wrong shape, naming the network and
         the observation space, or if the selector would choose actions by other values than the critic learns
     """
+    _check_initialised(model.policy)
     if not (hasattr(model.policy, "actor") and hasattr(model.policy, "critic")):
         return
-    _check_initialised(model.policy)
     try:
         policy: Any = copy.deepcopy(model.policy)
     except Exception:
@@ -121,8 +123,6 @@ def try_networks(model: OffPolicyAlgorithm) -> None:
         check_scores(policy, model, observations)
 
 
-def _try_on(policy: Any, model: OffPolicyAlgorithm, is_random: bool) -> Any:
-    """Try a copied policy on a batch of random observations, or of zeros where the space has them, and return the batch."""
 def _check_initialised(policy: th.nn.Module) -> None:
     """Refuse parameters of lazy modules, of which each network and its target would make others at their first call."""
     for name, parameter in policy.named_parameters():
@@ -133,6 +133,8 @@ def _check_initialised(policy: th.nn.Module) -> None:
         require(not is_lazy(parameter), f"policy.{name}", parameter, allowed)
 
 
+def _try_on(policy: Any, model: OffPolicyAlgorithm, is_random: bool) -> Any:
+    """Try a copied policy on a batch of random observations, or of zeros where the space has them, and return the batch."""
     batch_size = min(model.batch_size, 3)
     observations = _make_observations(model.observation_space, batch_size, model.device, is_random)
     actions = th.zeros(batch_size, get_action_dim(model.action_space), device=model.device)

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs
 
 from sb3_cgp.common.spaces import by_key
 from sb3_cgp.guards.explanations import check_reset_info
+from sb3_cgp.guards.observation_fit import check_integers, check_shape, wrong_shape
 from sb3_cgp.guards.observations import innermost
 
 LARGEST_FLOAT32 = np.finfo(np.float32).max
@@ -56,7 +57,7 @@ def make_checks(observation_space: spaces.Space) -> list[Check]:
     """
     return [
         check_rewards,
-        check_observation_shapes,
+        check_observation_fit,
         check_finite_values,
         BoundsWatch(observation_space),
         check_final_observations,
@@ -74,19 +75,21 @@ def check_rewards(transition: Transition) -> None:
     if rewards is None:
         return
     if np.shape(rewards) != (transition.n_envs,):
-        raise _wrong_shape("reward", np.shape(rewards), (transition.n_envs,), timestep)
+        raise wrong_shape("reward", np.shape(rewards), (transition.n_envs,), timestep)
     if np.asarray(rewards).dtype.kind not in "biuf":
         raise ValueError(f"The environment returned a reward that is not a number at environment step {timestep}: {rewards}.")
 
 
-def check_observation_shapes(transition: Transition) -> None:
+def check_observation_fit(transition: Transition) -> None:
     """
-    Refuse observations of another shape than their space's.
+    Refuse observations that do not fit their space.
 
     :param transition: the transition
-    :raises ValueError: naming the shape and the one that is expected
+    :raises ValueError: naming the key, the shape or the value, and what is expected
     """
-    check_shape("observation", transition.observations, transition.observation_space, transition.n_envs, transition.timestep)
+    observations, space, timestep = transition.observations, transition.observation_space, transition.timestep
+    check_shape("observation", observations, space, transition.n_envs, timestep)
+    check_integers("observation", observations, space, timestep)
 
 
 def check_finite_values(transition: Transition) -> None:
@@ -103,10 +106,10 @@ def check_finite_values(transition: Transition) -> None:
 
 def check_final_observations(transition: Transition) -> None:
     """
-    Refuse final observations of a wrong shape, or that are NaN or infinite.
+    Refuse final observations of a wrong shape, or that are NaN or infinite. `VecNormalize` may have normalised them.
 
     :param transition: the transition
-    :raises ValueError: naming the shape or the values
+    :raises ValueError: naming what is wrong
     """
     for observation in transition.final_observations:
         check_final_observation(observation, transition.observation_space, transition.timestep)
@@ -158,25 +161,6 @@ class BoundsWatch:
         )
 
 
-def check_shape(name: str, values: Any, space: spaces.Space, n_envs: int | None, timestep: int) -> None:
-    """
-    Refuse observations of another shape than their space's, which NumPy may broadcast to it.
-
-    :param name: the name of the values, for the error
-    :param values: the observations of all environments, or of one
-    :param space: the observation space
-    :param n_envs: number of environments; None for the observation of one
-    :param timestep: the environment step
-    :raises ValueError: naming the shape and the one that is expected
-    """
-    batch = () if n_envs is None else (n_envs,)
-    for key, subspace in by_key(space).items():
-        shape, expected = np.shape(values if key is None else values[key]), (*batch, *(subspace.shape or ()))
-        # NumPy may drop leading axes of length 1, or add them: no number is lost or repeated
-        if shape != expected and _without_leading_ones(shape) != _without_leading_ones(expected):
-            raise _wrong_shape(name if key is None else f"{name} `{key}`", shape, expected, timestep)
-
-
 def check_finite(name: str, values: Any, timestep: int) -> None:
     """
     Refuse values that are NaN or infinite in float32.
@@ -203,7 +187,7 @@ def check_final_observation(observation: Any, space: spaces.Space, timestep: int
     :param observation: the observation of one environment
     :param space: the observation space
     :param timestep: the environment step
-    :raises ValueError: naming the shape or the values
+    :raises ValueError: naming what is wrong
     """
     check_shape("terminal observation", observation, space, None, timestep)
     check_finite("terminal observation", _stored(observation, space), timestep)
@@ -212,16 +196,6 @@ def check_final_observation(observation: Any, space: spaces.Space, timestep: int
 def _stored(observation: Any, space: spaces.Space) -> dict[Any, Any]:
     """Return the parts of an observation that its space has: further keys of a ``Dict`` may hold anything."""
     return {key: observation if key is None else observation[key] for key in by_key(space)}
-
-
-def _wrong_shape(name: str, shape: tuple[int, ...], expected: tuple[int, ...], timestep: int) -> ValueError:
-    message = f"The environment returned an array of a wrong shape at environment step {timestep}"
-    return ValueError(f"{message}: the {name} has shape {shape}, where {expected} is expected. It was not stored.")
-
-
-def _without_leading_ones(shape: tuple[int, ...]) -> tuple[int, ...]:
-    n_ones = next((index for index, length in enumerate(shape) if length != 1), len(shape))
-    return shape[n_ones:]
 
 
 class TransitionGuard(OffPolicyAlgorithm):
