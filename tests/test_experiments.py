@@ -122,6 +122,41 @@ def test_later_settings_go_before_earlier_ones(tmp_path, sweep_of):
     assert sweep.runs()[0].key == "TD3,batch_size=8,Pendulum-v1,seed=0"
 
 
+@pytest.mark.parametrize(("options", "found"), [({}, [64, 8, 16]), ({"hyperparams": {"batch_size": 4}}, [4, 4, 4])])
+def test_a_method_of_the_file_goes_before_what_the_file_has_for_all(tmp_path, sweep_of, options, found):
+    sizes = {"big": {"batch_size": 64}, "small": {"batch_size": 8}, "usual": {}}
+    methods = {name: {"algo": "td3", "hyperparams": size} for name, size in sizes.items()}
+    sweep_of(hyperparams={"batch_size": 16, "learning_starts": 7}, methods=methods, seeds=1)
+    runs = load_sweep(str(tmp_path / "mine.yml"), options).runs()
+    assert [run.hyperparams["batch_size"] for run in runs] == found
+    assert {run.hyperparams["learning_starts"] for run in runs} == {7}
+
+
+@pytest.mark.parametrize(
+    ("changes", "copies"),
+    [
+        ({"axes": {"batch": {"values": [8, 64], "sets": {"batch_size": 32}}}}, "TD3,batch=8 and TD3,batch=64"),
+        (
+            {"axes": {"a": {"values": [8, 16], "sets": {"batch_size": "$value"}}, "batch_size": {"values": [32]}}},
+            "CGP-Online,a=8,batch_size=32 and CGP-Online,a=16,batch_size=32",
+        ),
+        (
+            {
+                "methods": {name: {"algo": "td3", "hyperparams": {"policy_kwargs": name}} for name in ("one", "other")},
+                "axes": {"width": {"values": [4], "sets": {"policy_kwargs": "dict(net_arch=[$value])"}}},
+            },
+            "one,width=4 and other,width=4",
+        ),
+        ({"axes": {"gamma": {"values": [0.5, 0.9], "sets_for": {"TD3": {}}}}}, "TD3,gamma=0.5 and TD3,gamma=0.9"),
+        ({"axes": {"gamma": {"values": [0.5, 0.9]}}}, None),
+    ],
+)
+def test_configurations_that_are_the_same_are_named(sweep_of, capsys, changes, copies):
+    sweep_of(**changes)
+    told = capsys.readouterr().err
+    assert f"mine.yml: {copies} have the same hyperparameters" in told if copies else told == ""
+
+
 @pytest.mark.parametrize(
     ("axis", "is_replaced"),
     [

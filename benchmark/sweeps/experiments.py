@@ -42,6 +42,7 @@ class Sweep:
     :param changes: the changes that have an effect, as text, without tasks, seeds and methods, which are those of the runs
     :param path: the file; None for a sweep without one
     :param is_shortened: whether the runs are shorter than the file says
+    :param given: the hyperparameters for all methods that the command line sets, which are in the file's, too
     """
 
     name: str
@@ -50,6 +51,7 @@ class Sweep:
     changes: list[str] = field(default_factory=list)
     path: Path | None = None
     is_shortened: bool = False
+    given: Hyperparams = field(default_factory=dict)
 
     @property
     def seeds(self) -> list[int]:
@@ -96,7 +98,11 @@ class Sweep:
         file = self.file
         # The steps are the sweep's, and its own callback saves states
         entry = {name: value for name, value in self._entries[method, task].items() if name not in ("n_timesteps", "callback")}
-        hyperparams = entry | self.methods[method].hyperparams | self._warm_up(method, task) | file.hyperparams
+        own = self.methods[method].hyperparams
+        hyperparams = entry | own | self._warm_up(method, task)
+        # Methods of the file itself are more special than what it has for all of them
+        special = {key: hyperparams[key] for key in own} if isinstance(file.methods, dict) else {}
+        hyperparams = hyperparams | file.hyperparams | special | self.given
         for axis, value in settings.items():
             hyperparams = hyperparams | file.axes[axis].hyperparams(axis, value, method)
         return Run(
@@ -247,9 +253,8 @@ def load_sweep(name: str, overrides: dict[str, Any] | None = None, methods: Sequ
     for method in chosen:
         if method not in known:
             raise SweepError("the command line", "methods", f"{method!r} must be one of {', '.join(known)}")
-    sweep = Sweep(
-        path.stem, file, {method: known[method] for method in chosen}, path=path, is_shortened=file.steps < own_steps
-    )
+    chosen_methods = {method: known[method] for method in chosen}
+    sweep = Sweep(path.stem, file, chosen_methods, path=path, is_shortened=file.steps < own_steps, given=changed)
     if not sweep.runs():
         raise SweepError(path, "exclude", "leaves no combination of the axes' values")
     replaced = _replaced_hyperparams(sweep)
@@ -263,7 +268,19 @@ def load_sweep(name: str, overrides: dict[str, Any] | None = None, methods: Sequ
     for run in {run.configuration: run for run in sweep.runs()}.values():
         for key, problem in problems(run.method, run.algo, run.hyperparams):
             raise SweepError(_origin(sweep, path, run, key, changed), key, problem)
+    for copies in _copies(sweep):
+        text = "have the same hyperparameters, so that their runs are the same"
+        print(f"Warning: {path}: {' and '.join(copies)} {text}.", file=sys.stderr)
     return sweep
+
+
+def _copies(sweep: Sweep) -> list[tuple[str, ...]]:
+    """Return the configurations that have the same hyperparameters on a task, those of the same together."""
+    alike: dict[str, dict[str, None]] = {}
+    for run in sweep.runs():
+        same = json.dumps([run.task, run.algo, run.hyperparams], sort_keys=True, default=str)
+        alike.setdefault(same, {})[run.configuration] = None
+    return list(dict.fromkeys(tuple(names) for names in alike.values() if len(names) > 1))
 
 
 def _replaced_hyperparams(sweep: Sweep) -> dict[str, str]:
