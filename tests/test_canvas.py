@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from benchmark.common.canvas import legend, panels, png
-from benchmark.reporting import drawing
+from benchmark.reporting import drawing, learning_curves
 from benchmark.reporting.scores import read_study, score_table
 
 LONG = "A method with a long name"
@@ -46,6 +46,20 @@ def assert_all_letters_are_seen(figure: Figure) -> None:
             assert min(box.x0, box.y0) >= -slack, text
             assert box.x1 <= room.x1 + slack, text
             assert box.y1 <= room.y1 + slack, text
+
+
+@pytest.mark.parametrize("name", ["lr $1e-3 _ $", r"A $\foo$", "$x^2$"])
+def test_dollar_signs_in_names_are_letters(tmp_path: Path, drawn: list[Figure], name: str) -> None:
+    """In pairs, Matplotlib reads them as mathematics."""
+    settings = [{f"noise {name}": value} for value in (name, "0.1")]
+    study = read_study(write_study(tmp_path / "mine", runs(lambda *run: float(run[2]), [name], settings, range(2), [name])))
+    drawing.sensitivity(study, name)
+    drawing.stability(score_table([study]), study.methods, 10)
+    drawing.values(study, score_table([study]), name, 10)
+    drawing.final_rewards(study, score_table([study]), 10)
+    assert learning_curves.curves_by_steps(study, name, 10)
+    assert len(drawn) == 4
+    assert not any(text.get_parse_math() for figure in drawn for text in figure.findobj(Text) if isinstance(text, Text))
 
 
 @pytest.mark.parametrize("methods", [["CGP-Online"], [LONG], [LONG, f"{LONG} of letters"]])

@@ -328,6 +328,11 @@ def test_a_subset_of_seeds_and_a_checkpoint_interval(sweep_of):
         (dict(axes={"gamma": {"values": [0.5]}}, exclude=[{"gamma": 0.5}]), "exclude", "leaves no combination"),
         (dict(seeds="0-3"), "seeds", "must be a number of seeds, or a list of seeds, such as [0, 1, 2, 3]"),
         (dict(axes={"a": {"values": {True: {}}}}), "axes.a.values", "it is True, as YAML reads it: write it in quotes"),
+        (dict(title="A\nsweep"), "'A\\nsweep'", "must be a name of one line"),
+        (dict(methods={"A\n": {"algo": "td3"}}), "'A\\n'", "must be a name of one line"),
+        (dict(axes={"x\t": {"values": [1], "sets": {}}}), "'x\\t'", "must be a name of one line"),
+        (dict(axes={"gamma": {"values": ["a\nb"]}}), "'a\\nb'", "must be a name of one line"),
+        (dict(axes={"a": {"values": {"b\r": {}}}}), "'b\\r'", "must be a name of one line"),
         (dict(axes={"a": {"values": {32: {}}}}), "axes.a.values", "it is 32, as YAML reads it: write it in quotes"),
     ],
 )

@@ -21,6 +21,8 @@ LOOK: dict[Any, Any] = {
     "legend.fontsize": 11.5,
     "axes.spines.top": False,
     "axes.spines.right": False,
+    # Names of methods and values are a user's own, and a dollar sign in them is one
+    "text.parse_math": False,
 }
 # How often a figure is enlarged at most, the inches that letters may be beyond its edge, and those between two titles
 ENLARGEMENTS, SLACK, TITLE_GAP = 4, 0.03, 0.1

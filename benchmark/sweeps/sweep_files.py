@@ -220,6 +220,10 @@ class SweepFile(Strict):
     def _check(self) -> "SweepFile":
         if self.evaluation_interval > self.steps:
             raise ValueError(f"`evaluation_interval` is {self.evaluation_interval}, but must be at most `steps`, {self.steps}")
+        values = [value for axis in self.axes.values() for value in axis.values if isinstance(value, str)]
+        for name in (self.title, *self.methods, *self.axes, *values):
+            if not name.isprintable():
+                raise ValueError(f"{name!r} must be a name of one line, without tabs, as it stands in headings and tables")
         for name, axis in self.axes.items():
             if name in RESERVED:
                 raise ValueError(
