@@ -65,7 +65,7 @@ def write_study(folder: Path, records: list[Record], planned: int | None = None)
         "methods": list(dict.fromkeys(run.method for run in records)),
         "tasks": list(dict.fromkeys(run.task for run in records)),
         "seeds": sorted({run.seed for run in records}),
-        "steps": STEPS,
+        "steps": max((run.steps for run in records), default=STEPS),
         "evaluation_interval": INTERVAL,
         "evaluation_episodes": 5,
         "settings_in_words": "Hidden width 64.",

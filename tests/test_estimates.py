@@ -25,7 +25,7 @@ def test_failed_run_counts_with_the_lowest_return_of_any_evaluation_on_its_task(
     records = [
         record("CGP-Online", 0, -150.0, returns=[-1_700.0, -150.0]),
         record("TD3", 0, None, returns=[-1_200.0, math.nan]),
-        record("SAC", 0, math.nan, returns=[-900.0]),
+        record("SAC", 0, None, returns=[-900.0]),
         record("TD3", 0, None, task="Reacher-v5", returns=[]),
         record("TD3", 1, -4.0, task="Reacher-v5", returns=[-60.0, -4.0]),
     ]

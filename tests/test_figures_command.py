@@ -43,7 +43,7 @@ def test_mistakes_are_named(folder: Path, tmp_path: Path, capsys: pytest.Capture
         ("study.json", '{"title":\n', r"study\.json, line 2, is no JSON: Expecting value\. Move it away"),
         ("study.json", "\udcff", r"study\.json is no text in UTF-8\. Move it away"),
         ("study.json", None, r"study\.json is missing; give the command of its sweep again"),
-        ("runs.jsonl", '{"seed": 1}\n', r"runs\.jsonl, line 1, is no record of a run: .*'experiment'.*Move it away"),
+        ("runs.jsonl", '{"seed": 1}\n', r"runs\.jsonl, line 1, is no record of a run: experiment: .*Move it away"),
         ("../../runtime/runtime.json", "", r"runtime\.json, line 1, is no JSON: .*benchmark\.runtime"),
     ],
 )

@@ -1,6 +1,8 @@
 """The command `python -m benchmark.sweep`: its options, sweep files' values, and what it records."""
 
 import json
+import math
+from dataclasses import asdict, replace
 
 import pytest
 import yaml
@@ -8,7 +10,7 @@ from sweep_commands import SMALL, of_command_line
 
 from benchmark import tune, worker
 from benchmark.common.arguments import hyperparameter
-from benchmark.common.records import Record, read_records, write_records
+from benchmark.common.records import RUNS, Record, read_records, write_records
 from benchmark.sweep import main, parse
 from benchmark.sweeps.checks import check_values
 from benchmark.sweeps.execution import describe
@@ -171,6 +173,42 @@ def test_records_come_back(tmp_path):
     ]
     write_records(tmp_path, records)
     assert sorted(read_records(tmp_path), key=str) == sorted(records, key=str)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"final": math.nan}, r"final: nan must be finite, or null with an error"),
+        ({"final": "4"}, r"final: .* \(it is '4'\)"),
+        ({"final": None}, r"final: None and error: None: one of them must be null, and the other one not"),
+        ({"error": "ValueError"}, r"final: 4\.0 and error: 'ValueError': one of them must be null"),
+        ({"returns": [1.0]}, r"returns: 1 must be as many as timesteps, 2"),
+        ({"timesteps": [10, 5]}, r"timesteps: must ascend"),
+        ({"timesteps": [5, 5]}, r"timesteps: must ascend"),
+        ({"seed": "0"}, r"seed: .* \(it is '0'\)"),
+        ({"steps": 99}, r"steps: 99 must be those of study\.json, 10"),
+        ({"score": 1.0}, r"score: "),
+    ],
+)
+def test_a_record_that_contradicts_itself_or_its_study_is_refused(tmp_path, changes, problem):
+    good = Record("e", "A", "Pendulum-v1", {}, 0, 10, [5, 10], [math.nan, 2.0], 4.0, None, 1.0)
+    lines = [json.dumps(asdict(good)), json.dumps(asdict(good) | {"seed": 1} | changes)]
+    (tmp_path / RUNS).write_text("\n".join(lines))
+    with pytest.raises(ValueError, match=rf"runs\.jsonl, line 2, is no record of a run: {problem}.*\. Move it away"):
+        read_records(tmp_path, steps=10)
+
+
+def test_a_run_is_read_once(tmp_path):
+    """Files that were put together have lines twice."""
+    good = Record("e", "A", "Pendulum-v1", {}, 0, 10, [5, 10], [math.nan, 2.0], 4.0, None, 1.0)
+    write_records(tmp_path, [good, good])
+    (record,) = read_records(tmp_path)
+    assert record.key == good.key
+    write_records(tmp_path, [good, replace(good, final=5.0)])
+    with pytest.raises(
+        ValueError, match=r"runs\.jsonl, lines 1 and 2, are different records of the run A,Pendulum-v1,seed=0\. Move it away"
+    ):
+        read_records(tmp_path)
 
 
 def test_the_description_is_plain_data_and_names_each_configuration():

@@ -1,10 +1,12 @@
 """The records of a sweep's ended runs, a line of JSON for each."""
 
+import itertools
 import json
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from benchmark.common.files import parse_json, read_json
 from sb3_cgp.common.files import write_atomically
@@ -72,6 +74,8 @@ class Record:
     :param processors: the processor that trained it, several if it was continued on others; none where they were not recorded
     """
 
+    __pydantic_config__: ClassVar = {"strict": True, "extra": "forbid"}
+
     experiment: str
     method: str
     task: str
@@ -104,23 +108,54 @@ def write_records(folder: Path, records: Iterable[Record]) -> None:
     write_atomically(folder / RUNS, "".join(f"{line}\n" for line in lines).encode())
 
 
-def read_records(folder: Path) -> list[Record]:
+def read_records(folder: Path, steps: int | None = None) -> list[Record]:
     """
     Read the records of a study.
 
     :param folder: the study's folder
-    :return: the runs
+    :param steps: the steps of its runs by its description; None if they are not to be compared
+    :return: the runs, each once, also where lines of the file are equal
     :raises FileNotFoundError: if it holds none
-    :raises ValueError: if one is damaged; it names the file, the line and the remedy
+    :raises ValueError: if one is damaged, or two differ on one run; it names the file, the line and the remedy
     """
-    path, records = folder / RUNS, []
+    # The extra of sweeps has it, which `make train` does not need
+    from pydantic import TypeAdapter, ValidationError
+
+    kind = TypeAdapter(Record)
+    path = folder / RUNS
+    records: dict[str, tuple[int, Record]] = {}
     for number, line in enumerate(path.read_bytes().splitlines(), start=1):
-        fields = parse_json(line, path, remedy=REMEDY, first_line=number)
+        parse_json(line, path, remedy=REMEDY, first_line=number)
         try:
-            records.append(Record(**fields))
-        except TypeError as error:
-            raise ValueError(f"{path}, line {number}, is no record of a run: {error}. {REMEDY}") from error
-    return records
+            record = kind.validate_json(line)
+            found = list(_contradictions(record, steps))
+        except ValidationError as error:
+            found = list(map(_in_words, error.errors()))
+        if found:
+            raise ValueError(f"{path}, line {number}, is no record of a run: {'; '.join(found)}. {REMEDY}")
+        first, other = records.setdefault(record.key, (number, record))
+        # As text, in which NaN equals itself
+        if str(other) != str(record):
+            raise ValueError(f"{path}, lines {first} and {number}, are different records of the run {record.key}. {REMEDY}")
+    return [record for _, record in records.values()]
+
+
+def _contradictions(record: Record, steps: int | None) -> Iterator[str]:
+    if len(record.timesteps) != len(record.returns):
+        yield f"returns: {len(record.returns)} must be as many as timesteps, {len(record.timesteps)}"
+    if any(after <= before for before, after in itertools.pairwise(record.timesteps)):
+        yield "timesteps: must ascend"
+    if (record.final is None) == (record.error is None):
+        yield f"final: {record.final} and error: {record.error!r}: one of them must be null, and the other one not"
+    if record.final is not None and not math.isfinite(record.final):
+        yield f"final: {record.final} must be finite, or null with an error"
+    if steps not in (None, record.steps):
+        yield f"steps: {record.steps} must be those of {STUDY}, {steps}"
+
+
+def _in_words(error: Any) -> str:
+    given = "" if isinstance(error["input"], dict) else f" (it is {error['input']!r:.60})"
+    return f"{'.'.join(map(str, error['loc']))}: {error['msg']}{given}"
 
 
 def entries_by_task(description: dict[str, Any]) -> dict[tuple[str, str], dict[str, Any]]:

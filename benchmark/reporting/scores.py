@@ -138,7 +138,8 @@ def read_study(folder: Path) -> Study:
     :raises ValueError: if it is no study's folder, or a file of it is damaged; it names the file and the remedy
     """
     try:
-        return Study(folder.resolve().name, folder, read_description(folder), read_records(folder))
+        facts = read_description(folder)
+        return Study(folder.resolve().name, folder, facts, read_records(folder, facts["steps"]))
     except FileNotFoundError as error:
         missing = Path(error.filename).name
         raise ValueError(f"{folder} is no folder of a study: {missing} is missing; {REWRITE}") from error
@@ -183,9 +184,9 @@ def failed(record: Record) -> bool:
     Return whether a run has no score of its own.
 
     :param record: the run
-    :return: whether it raised an error, or its final return is not finite
+    :return: whether it raised an error
     """
-    return record.final is None or not math.isfinite(record.final)
+    return record.final is None
 
 
 def floors(records: Iterable[Record]) -> dict[str, float]:

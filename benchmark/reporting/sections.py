@@ -137,7 +137,7 @@ def state(study: Study) -> list[str]:
     lines = [f"{ended:,} of {planned:,} planned runs have ended, {len(lost):,} of them failed."]
     if ended < planned:
         lines[0] += " **The rest is missing: the results below may change.**"
-    reasons = Counter((record.method, _first_line(record.error or "the final return is no number")) for record in lost)
+    reasons = Counter((record.method, _first_line(record.error or "")) for record in lost)
     errors = [
         f"- {method}: `{reason}` ({number} run{'s' * (number > 1)})"
         for (method, reason), number in reasons.most_common(ERRORS)

@@ -110,4 +110,5 @@ def ended_runs(folder: Path, description: dict[str, Any]) -> tuple[list[Record],
     used = processors_of_commands(was["commands"])
     # Earlier versions recorded the machines of the commands only
     known = used if len(used) == 1 else []
-    return [replace(record, processors=record.processors or known) for record in read_records(folder)], was["commands"]
+    records = read_records(folder, was["steps"])
+    return [replace(record, processors=record.processors or known) for record in records], was["commands"]
