@@ -79,7 +79,7 @@ def test_stability_is_a_count_of_runs() -> None:
     rng = np.random.default_rng(0)
     cells = [rng.integers(10, size=4).astype(float) for _ in range(6)]
     levels = np.unique(np.concatenate(cells))
-    share, band = bootstrap(lambda scores: share_reaching(scores, levels), [cells], 200)
+    share, band = bootstrap(lambda scores: share_reaching(scores, levels), [dict(enumerate(cells))], 200)
     counted = [sum(score >= level for cell in cells for score in cell) / 24 for level in levels]
     assert share.tolist() == pytest.approx(counted)
     assert band is not None
@@ -91,7 +91,7 @@ def test_stability_is_a_count_of_runs() -> None:
 def test_interquartile_mean_is_that_of_rliable_for_cells_of_any_size() -> None:
     rng = np.random.default_rng(1)
     cells = [rng.normal(size=number) for number in (4, 6, 4, 5)]
-    found = estimate(interquartile_mean, [cells], 500)
+    found = estimate(interquartile_mean, [dict(enumerate(cells))], 500)
     pooled = np.concatenate(cells)
     assert found.value == pytest.approx(metrics.aggregate_iqm(pooled))
     assert found.runs == 19
@@ -105,26 +105,26 @@ def test_the_interval_of_four_runs_is_their_range() -> None:
     rng = np.random.default_rng(5)
     for number in (4, 5):
         scores = rng.normal(size=number)
-        is_range = estimate(interquartile_mean, [[scores]], 2_000).interval == (scores.min(), scores.max())
+        is_range = estimate(interquartile_mean, [{0: scores}], 2_000).interval == (scores.min(), scores.max())
         assert is_range == (number == 4)
 
 
 def test_runs_are_drawn_within_cells_only() -> None:
     cells = [np.zeros(4), np.full(4, 10.0)]
-    assert estimate(lambda scores: scores.mean(axis=1), [cells], 50).interval == (5.0, 5.0)
+    assert estimate(lambda scores: scores.mean(axis=1), [dict(enumerate(cells))], 50).interval == (5.0, 5.0)
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_too_few_runs_of_a_configuration_have_no_interval(number: int) -> None:
-    found = estimate(interquartile_mean, [[np.full(number, 3.0)]], 50)
+    found = estimate(interquartile_mean, [{0: np.full(number, 3.0)}], 50)
     assert (found.value, found.interval) == (3.0, None)
     assert found.in_words(".1f") == "3.0 (no interval)"
-    assert estimate(interquartile_mean, [[np.arange(4.0), np.arange(float(number))]], 50).interval is None
-    assert estimate(interquartile_mean, [[np.arange(4.0)]], 50).interval is not None
+    assert estimate(interquartile_mean, [{0: np.arange(4.0), 1: np.arange(float(number))}], 50).interval is None
+    assert estimate(interquartile_mean, [{0: np.arange(4.0)}], 50).interval is not None
 
 
 def test_estimates_repeat_and_leave_the_global_random_state_alone() -> None:
-    cells = [np.random.default_rng(3).normal(size=5)]
+    cells = {0: np.random.default_rng(3).normal(size=5)}
     state = np.random.get_state()[1].tolist()  # noqa: NPY002
     first = estimate(interquartile_mean, [cells], 100)
     assert np.random.get_state()[1].tolist() == state  # noqa: NPY002
@@ -153,7 +153,7 @@ def test_probability_is_that_of_rliable() -> None:
 
 def test_intervals_are_those_of_rliable() -> None:
     scores = np.random.default_rng(5).normal(size=(6, 3))
-    found = estimate(interquartile_mean, [list(scores.T)], 2_000)
+    found = estimate(interquartile_mean, [dict(enumerate(scores.T))], 2_000)
     _, expected = get_interval_estimates({"": scores}, lambda each: np.array([metrics.aggregate_iqm(each)]), reps=2_000)
     assert found.interval == pytest.approx(tuple(expected[""].ravel()), abs=0.05)
 
@@ -171,7 +171,7 @@ def test_methods_are_compared_where_both_ran(tmp_path: Path) -> None:
 def test_cells_are_configurations(tmp_path: Path) -> None:
     configurations = [{"width": 32}, {"width": 64}, {"width": 128}]
     table = score_table([study(tmp_path, runs(lambda method, settings, seed: seed, ["TD3"], configurations))])
-    assert [cell.tolist() for cell in cells_of(table, "score")] == [[0, 1, 2, 3]] * 3
+    assert [cell.tolist() for cell in cells_of(table, "score").values()] == [[0, 1, 2, 3]] * 3
 
 
 def test_configurations_in_words() -> None:

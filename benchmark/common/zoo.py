@@ -54,6 +54,24 @@ def random_steps(algo: str, hyperparams: Mapping[str, Any]) -> int:
     return int(hyperparams.get("learning_starts", default))
 
 
+def without_defaults(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return the hyperparameters of a run without those that are its algorithm's defaults.
+
+    :param entry: the hyperparameters, and "algo", the algorithm's name in rl_zoo3
+    :return: those that differ; all, for an algorithm that is not known
+    """
+    register()
+    parameters = inspect.signature(ALGOS[entry["algo"]]).parameters if entry["algo"] in ALGOS else {}
+    defaults = {name: _each_step(parameter.default) for name, parameter in parameters.items()}
+    return {name: value for name, value in entry.items() if name not in defaults or _each_step(value) != defaults[name]}
+
+
+def _each_step(value: Any) -> Any:
+    """Return a frequency in steps as a number, as SB3 takes both."""
+    return value[0] if isinstance(value, list | tuple) and list(value[1:]) == ["step"] else value
+
+
 def shortened_warm_up(algo: str, hyperparams: Mapping[str, Any], steps: int) -> dict[str, int]:
     """
     Return the hyperparameter by which at most a tenth of a shortened run's steps are random.

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from benchmark.reporting.comparisons import RANDOM, task_difference
+from benchmark.reporting.copies import without_copies
 from benchmark.reporting.estimates import (
     FEWEST_RUNS,
     REPETITIONS,
@@ -176,7 +177,7 @@ def inference_cost(runtime: dict[str, Any] | None, repetitions: int) -> list[Par
         return []
     few, many = min(ours), max(ours)
     # The methods are timed in turn, so that a slow round affects both
-    found = estimate(lambda ratios: np.median(ratios, axis=1), [[ours[many] / ours[few]]], repetitions)
+    found = estimate(lambda ratios: np.median(ratios, axis=1), [{"": ours[many] / ours[few]}], repetitions)
     text = f"by `benchmark.runtime`, acting after {many} iterations takes {found.in_words()} times as long as after {few}"
     cem = seconds("CEM-")
     note = f"CEM itself {np.median(cem[many] / cem[few]):.2f} times" if {few, many} <= set(cem) else ""
@@ -281,4 +282,4 @@ def _each(table: pd.DataFrame, methods: Sequence[str], statistic: Statistic) -> 
     def mean_over_tasks(runs: pd.DataFrame) -> float:
         return float(np.mean([statistic(shares.to_numpy()[None])[0] for _, shares in runs.groupby("task")["share"]]))
 
-    return [mean_over_tasks(common[common["method"] == method]) for method in methods]
+    return [mean_over_tasks(without_copies(common[common["method"] == method])) for method in methods]

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from benchmark.common.tables import markdown_table
+from benchmark.reporting.copies import without_copies
 from benchmark.reporting.estimates import (
     FEWEST_RUNS,
     REPETITIONS,
@@ -125,7 +126,7 @@ def pooled_rows(table: pd.DataFrame, methods: Sequence[str]) -> list[list[str]]:
     """
     tasks, rows = list(dict.fromkeys(table["task"])), []
     for pair in pairs_of(methods):
-        common = in_common(table, pair)
+        common = without_copies(in_common(table, pair))
         singles = {task: task_difference(common, task, pair) for task in tasks}
         enough = [task for task, found in singles.items() if found is not None and found.runs >= FEWEST_RUNS]
         if len(enough) > 1:

@@ -1,7 +1,7 @@
 """Estimates with intervals, by rliable's bootstrap or Student's t: every statistic of the results page."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,8 +9,12 @@ import pandas as pd
 from rliable.library import StratifiedIndependentBootstrap
 from scipy import stats
 
+from benchmark.reporting.copies import without_copies
+
 # Of draws of runs at once: a call of SciPy for each would take most of the time
 Statistic = Callable[..., np.ndarray]
+# The runs of each configuration, by a key that is the same for copies of them
+Cells = Mapping[Hashable, np.ndarray]
 
 REPETITIONS = 2_000
 # Fewer runs on either side of a comparison decide nothing: even if no run of three overlaps with the other three, chance alone
@@ -54,10 +58,11 @@ class Estimate:
 
 
 def bootstrap(
-    statistic: Statistic, groups: Sequence[Sequence[np.ndarray]], repetitions: int = REPETITIONS
+    statistic: Statistic, groups: Sequence[Cells], repetitions: int = REPETITIONS
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """
-    Estimate a statistic of groups of runs, drawing runs within each cell (a task and a configuration), not across cells.
+    Estimate a statistic of groups of runs, drawing runs within each cell (a task and a configuration), not across cells. A
+    cell that several groups have is drawn once for all of them.
 
     :param statistic: takes an array per group, (R, N, ...), of R draws of its N runs in any order, and returns (R, ...)
     :param groups: each group's cells, of shape (runs, ...)
@@ -65,15 +70,18 @@ def bootstrap(
     :return: the statistic (...), and its 95 % interval (2, ...); None where a cell has fewer than
         :data:`FEWEST_RUNS` runs, of which a bootstrap interval is far too narrow
     """
-    value = statistic(*(np.concatenate(cells)[None] for cells in groups))[0]
-    if any(len(cell) < FEWEST_RUNS for cells in groups for cell in cells):
+    value = statistic(*(np.concatenate(list(cells.values()))[None] for cells in groups))[0]
+    if any(len(cell) < FEWEST_RUNS for cells in groups for cell in cells.values()):
         return value, None
     # rliable draws within columns: cells of one size are the columns of one array
-    arrays, owners = [], []
-    for owner, cells in enumerate(groups):
-        for size in sorted({len(cell) for cell in cells}):
-            arrays.append(np.stack([cell for cell in cells if len(cell) == size], axis=1))
-            owners.append(owner)
+    arrays: list[np.ndarray] = []
+    places: dict[Hashable, tuple[int, int]] = {}
+    for cells in groups:
+        for size in sorted({len(cell) for cell in cells.values()}):
+            new = [key for key, cell in cells.items() if len(cell) == size and key not in places]
+            if new:
+                places |= {key: (len(arrays), column) for column, key in enumerate(new)}
+                arrays.append(np.stack([cells[key] for key in new], axis=1))
     # rliable ignores its random_state and draws from NumPy's global generator
     state = np.random.get_state()  # noqa: NPY002
     np.random.seed(0)  # noqa: NPY002
@@ -81,18 +89,15 @@ def bootstrap(
         draws = [drawn for drawn, _ in StratifiedIndependentBootstrap(*arrays).bootstrap(repetitions)]
     finally:
         np.random.set_state(state)  # noqa: NPY002
-    drawn = [
-        np.stack(each).reshape(repetitions, array.shape[0] * array.shape[1], *array.shape[2:])
-        for each, array in zip(zip(*draws, strict=True), arrays, strict=True)
-    ]
+    drawn = [np.stack(each) for each in zip(*draws, strict=True)]
     pooled = (
-        np.concatenate([each for each, owner in zip(drawn, owners, strict=True) if owner == group], axis=1)
-        for group in range(len(groups))
+        np.concatenate([drawn[array][:, :, column] for array, column in map(places.__getitem__, cells)], axis=1)
+        for cells in groups
     )
     return value, np.percentile(statistic(*pooled), [2.5, 97.5], axis=0)
 
 
-def estimate(statistic: Statistic, groups: Sequence[Sequence[np.ndarray]], repetitions: int = REPETITIONS) -> Estimate:
+def estimate(statistic: Statistic, groups: Sequence[Cells], repetitions: int = REPETITIONS) -> Estimate:
     """
     Estimate one number, as :func:`bootstrap` does.
 
@@ -102,19 +107,22 @@ def estimate(statistic: Statistic, groups: Sequence[Sequence[np.ndarray]], repet
     :return: the estimate
     """
     value, interval = bootstrap(statistic, groups, repetitions)
-    runs = min(sum(len(cell) for cell in cells) for cells in groups)
+    runs = min(sum(map(len, cells.values())) for cells in groups)
     return Estimate(float(value), None if interval is None else (float(interval[0]), float(interval[1])), runs)
 
 
-def cells_of(table: pd.DataFrame, column: str) -> list[np.ndarray]:
+def cells_of(table: pd.DataFrame, column: str) -> dict[Hashable, np.ndarray]:
     """
-    Split runs of one method into cells.
+    Split runs of one method into cells, without copies.
 
     :param table: the runs' scores
     :param column: the column wanted
-    :return: an array of each cell's runs
+    :return: an array of each cell's runs, by what they were trained with and their values
     """
-    return [cell.to_numpy(dtype=float) for _, cell in table.groupby("cell", sort=True)[column]]
+    ordered = without_copies(table.sort_values("cell", kind="stable"))
+    cells = {name: cell.to_numpy(dtype=float) for name, cell in ordered.groupby("trained", sort=False)[column]}
+    # The scores of copies that other machines trained differ, so that they are drawn by themselves
+    return {(name, *cell): cell for name, cell in cells.items()}
 
 
 def in_common(table: pd.DataFrame, methods: Sequence[str]) -> pd.DataFrame:

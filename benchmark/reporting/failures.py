@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from benchmark.reporting.estimates import cells_of, estimate
+from benchmark.reporting.estimates import Cells, cells_of, estimate
 from benchmark.reporting.verdicts import OURS, Part, judge
 
 LEARNING_RATE, INITIAL_STEPS = "learning_rate", "learning_starts"
@@ -63,7 +63,7 @@ def _fails(table: pd.DataFrame, axis: str, is_bad: pd.Series, repetitions: int) 
         rest=[str({name: value for name, value in values.items() if name != axis}) for values in table["values"]],
         is_bad=is_bad,
     )[table["method"] == OURS]
-    groups: list[list[np.ndarray]] = []
+    groups: list[Cells] = []
     bad_values: list[str] = []
     good_values: list[str] = []
     for _, runs in ours.groupby(["study", "task"], sort=False):
@@ -87,7 +87,7 @@ def _fails(table: pd.DataFrame, axis: str, is_bad: pd.Series, repetitions: int) 
         return np.mean([good.mean(axis=1) - poor.mean(axis=1) for good, poor in pairs], axis=0)
 
     found = estimate(lost, groups, repetitions)
-    pooled = [np.concatenate(group) for group in groups]
+    pooled = [np.concatenate(list(group.values())) for group in groups]
     means = [float(np.mean([np.mean(scores) for scores in pooled[start::2]])) for start in (1, 0)]
     halved = sum(np.sum(poor < 0.5 * np.mean(good)) for good, poor in zip(pooled[::2], pooled[1::2], strict=True))
     names = [" or ".join(dict.fromkeys(values)) for values in (bad_values, good_values)]

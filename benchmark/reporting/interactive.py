@@ -86,7 +86,7 @@ def _method(study: Study, runs: Sequence[Record], times: Times, repetitions: int
 
     color = look["color"]
     traces = []
-    middle, interval = bootstrap(interquartile_mean, [[lines]], repetitions)
+    middle, interval = bootstrap(interquartile_mean, [{"": lines}], repetitions)
     if interval is not None:
         hidden = {"line": {"width": 0}, "showlegend": False, "hoverinfo": "skip"}
         traces.append(trace("band", interval[0], True, **hidden))

@@ -205,7 +205,7 @@ def _figure(
                 beside = interquartile_mean(lines[reference][None])[0]
                 panel.plot(place(reference, grid), beside, label=f"{reference}, in all panels", **BESIDE)
         draw_seeds(panel, x, lines[method], looks[method]["color"])
-        middle, interval = bootstrap(interquartile_mean, [[lines[method]]], repetitions)
+        middle, interval = bootstrap(interquartile_mean, [{"": lines[method]}], repetitions)
         label, look = (
             (study.label(method, len(runs)), looks[method]) if is_alone else ("_method", looks[method] | {"linestyle": "-"})
         )

@@ -16,6 +16,7 @@ from benchmark.reporting.comparisons import (
     subjects_of,
     task_difference,
 )
+from benchmark.reporting.copies import without_copies
 from benchmark.reporting.estimates import (
     FEWEST_RUNS,
     REPETITIONS,
@@ -83,7 +84,7 @@ def finding(study: Study, table: pd.DataFrame, task: str, repetitions: int = REP
     :param repetitions: number of bootstrap samples
     :return: sentences, in Markdown
     """
-    runs = table[table["task"] == task]
+    runs = without_copies(table[table["task"] == task])
     form = number_format(runs["score"])
     methods = [method for method in dict.fromkeys(runs["method"]) if method != RANDOM] or [RANDOM]
     levels = [

@@ -6,8 +6,9 @@ from benchmark.common.records import FINAL_EPISODES
 from benchmark.common.tables import markdown_table
 from benchmark.reporting.claims import RULES
 from benchmark.reporting.comparisons import DIFFERENCES_RULE
+from benchmark.reporting.copies import COPIES_RULE, without_copies
 from benchmark.reporting.estimates import FEWEST_RUNS
-from benchmark.reporting.scores import FAILURE_RULE, Study
+from benchmark.reporting.scores import FAILURE_RULE, Study, score_table
 from benchmark.reporting.sections import Picture, fold
 from benchmark.reporting.side_runs import SIDE_RUNS_RULE
 from benchmark.reporting.verdicts import Finding
@@ -18,6 +19,8 @@ READING = f"""\
 
 A run's score, its *final return*, is the mean return of its final model over {FINAL_EPISODES} episodes, which are the same for
 all runs on a task. {FAILURE_RULE}
+
+{COPIES_RULE}
 
 Numbers that seem to contradict each other:
 
@@ -67,6 +70,9 @@ def introduction(studies: Sequence[Study]) -> str:
     """
     ended = sum(len(study.records) for study in studies)
     text = f"The final returns and learning curves of {ended:,} training runs."
+    table = score_table(studies)
+    if copies := len(table) - len(without_copies(table)):
+        text += f" {copies:,} of them are copies of others, and do not count a second time."
     unfinished = [study for study in studies if len(study.records) < study.facts["runs_planned"]]
     if unfinished:
         counts = [f"{study.name} ({len(study.records)} of {study.facts['runs_planned']} runs)" for study in unfinished]

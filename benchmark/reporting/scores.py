@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from benchmark.common.records import REWRITE, Record, read_description, read_records
+from benchmark.reporting.copies import Configurations
 
 FAILURE_RULE = (
     "A run that failed counts with the lowest return that any evaluation of any run on its task reached, and its learning "
@@ -211,18 +212,24 @@ def score_table(studies: Sequence[Study]) -> pd.DataFrame:
 
     :param studies: the studies
     :return: a row per run: study, method, task (with the steps where runs on it differ in them), settings, cell (what it
-        shares with the runs that differ from it in method and seed only), seed, failed, score, floor (the task's lowest
+        shares with the runs that differ from it in method and seed only), trained (what it shares with the runs of its method
+        that differ from it in the seed only, in any study), seed, failed, score, floor (the task's lowest
         return of any evaluation), range (from the floor to the task's best score), and share (of the range, from the floor)
     """
-    runs = [(study.name, record) for study in studies for record in study.in_order()]
-    lowest = floors(record for _, record in runs)
+    runs = [
+        (study.name, configurations, record)
+        for study, configurations in ((study, Configurations(study.facts)) for study in studies)
+        for record in study.in_order()
+    ]
+    lowest = floors(record for *_, record in runs)
     budgets: dict[str, set[int]] = {}
-    for _, record in runs:
+    for *_, record in runs:
         budgets.setdefault(record.task, set()).add(record.steps)
     rows = []
-    for study, record in runs:
+    for study, configurations, record in runs:
         several = len(budgets[record.task]) > 1
         settings = settings_in_words(record.settings)
+        cell = f"{study} {record.task} {record.steps} {settings}"
         rows.append(
             {
                 "study": study,
@@ -230,14 +237,15 @@ def score_table(studies: Sequence[Study]) -> pd.DataFrame:
                 "task": f"{record.task}, {record.steps:,} steps" if several else record.task,
                 "settings": settings,
                 "values": record.settings,
-                "cell": f"{study} {record.task} {record.steps} {settings}",
+                "cell": cell,
+                "trained": configurations.of(record, cell),
                 "seed": record.seed,
                 "failed": failed(record),
-                "score": lowest[record.task] if record.final is None or failed(record) else record.final,
+                "score": lowest[record.task] if record.final is None else record.final,
                 "floor": lowest[record.task],
             }
         )
-    columns = ["study", "method", "task", "settings", "values", "cell", "seed", "failed", "score", "floor"]
+    columns = ["study", "method", "task", "settings", "values", "cell", "trained", "seed", "failed", "score", "floor"]
     table = pd.DataFrame(rows, columns=columns)
     height = table["score"] - table["floor"]
     table["range"] = height.groupby(table["task"]).transform("max")

@@ -13,6 +13,7 @@ from benchmark.common.provenance import conditions_in_words
 from benchmark.common.records import RUNS
 from benchmark.common.tables import markdown_table
 from benchmark.reporting.comparisons import differences_table, improvement_table, subjects_of
+from benchmark.reporting.copies import without_copies
 from benchmark.reporting.estimates import FEWEST_RUNS, REPETITIONS, cells_of, estimate, interquartile_mean, number_format
 from benchmark.reporting.literature import literature_section
 from benchmark.reporting.machines import different_processors
@@ -260,6 +261,7 @@ def _reward_table(table: pd.DataFrame, columns: list[str], study: Study, repetit
     for names, runs in sorted(groups, key=lambda group: [first[name] for name in group[0]]):
         form = number_format(table[table["task"] == names[0]]["score"])
         found = estimate(interquartile_mean, [cells_of(runs, "score")], repetitions)
+        runs = without_copies(runs)
         scores = runs["score"]
         numbers = [f"{value:{form}}" for value in (scores.mean(), scores.min(), scores.max())]
         planned = study.planned_seeds(names[-1])

@@ -57,7 +57,7 @@ def _draw_learning(panel: Axes, study: Study, repetitions: int) -> None:
     for method, look in styles(methods_of(study, task)).items():
         runs = [record for record in study.records if (record.task, record.method) == (task, method)]
         lines = curves(runs, floor, grid)
-        middle, interval = bootstrap(interquartile_mean, [[lines]], repetitions)
+        middle, interval = bootstrap(interquartile_mean, [{"": lines}], repetitions)
         draw_seeds(panel, grid, lines, look["color"])
         draw_line(panel, grid, middle, study.label(method, len(runs)), look)
         if interval is not None:
