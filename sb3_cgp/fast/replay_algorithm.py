@@ -138,8 +138,7 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
     def _set_n_step_returns(self) -> None:
         """Give the model's ``n_steps`` and ``gamma`` to the buffer; a loaded one has those of the model that saved it."""
         buffer = self.replay_buffer
-        if self._chooses_n_step_returns(type(buffer)):
-            assert isinstance(buffer, NStepReplayBuffer)
+        if isinstance(buffer, NStepReplayBuffer) and self._chooses_n_step_returns(type(buffer)):
             buffer.n_steps, buffer.gamma = self.n_steps, self.gamma
 
     def train(self, *args: Any, **kwargs: Any) -> None:

@@ -19,10 +19,10 @@ def fit_action_noise(model: OffPolicyAlgorithm) -> None:
     """
     assert model.env is not None
     noise, n_envs = model.action_noise, model.env.num_envs
-    is_vectorized = isinstance(noise, VectorizedActionNoise)
-    if noise is None or n_envs == (len(noise.noises) if is_vectorized else 1):
+    n_noises = len(noise.noises) if isinstance(noise, VectorizedActionNoise) else 1
+    if noise is None or n_noises == n_envs:
         return
-    base = copy.deepcopy(noise.base_noise if is_vectorized else noise)
+    base = copy.deepcopy(noise.base_noise if isinstance(noise, VectorizedActionNoise) else noise)
     model.action_noise = base if n_envs == 1 else VectorizedActionNoise(base, n_envs)
 
 
