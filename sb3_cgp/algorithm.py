@@ -84,7 +84,7 @@ class CGP(
         cem_samples=16``, called CGP-Light, evaluates the critic an eighth as often. It needs an actor: with
         ``policy_training="offline"``, only the searches of that training start from it.
     :param cem_actor_fraction: with ``cem_start="actor"``, the share of ``cem_samples`` drawn around the actor's action.
-        The rest, but for the actor's action itself, is drawn from the prior.
+        One sample is that action itself; the others are drawn from the prior.
     :param cem_actor_std: standard deviation of the samples around the actor's action, before tanh
     :param cem_dtype: data type of all layers of the critic but the last one while CEM evaluates it: "auto" (the default),
         which is bfloat16 on processors that multiply it faster than float32, "float32" or "bfloat16". Values, actions and the
@@ -98,8 +98,8 @@ class CGP(
     :param policy_training: "online" trains the actor along with the critics, "offline" at the end of ``learn``
         (see :meth:`train_policy`)
     :param inference: what ``predict`` uses: the "actor", the "averaged_actor" (φ' of Algorithm 2) or "cem", the policy's
-        selector. None stands for the actor, or for CEM where there is no ``policy_loss``. Rollouts always use CEM, and so does
-        ``predict`` while the policy waits for its offline training, in a second ``learn`` too.
+        selector. None stands for the actor, or for CEM where there is no ``policy_loss``. Rollouts always use CEM. With
+        offline training, ``predict`` uses CEM until the policy has been trained, and again during a second ``learn``.
     :param actor_learning_rate: learning rate of the actor, in the same forms. None stands for ``learning_rate``.
     :param policy_delay: The actor is updated once every ``policy_delay`` gradient steps
     :param target_update_interval: The target critics and the averaged actor are updated once every
@@ -259,9 +259,9 @@ class CGP(
         """
         Train the policy to convergence on the critics and the replay buffer as they are (the paper's offline training).
 
-        It has converged when the loss, averaged over rounds of 1,000 gradient steps, has not fallen below its lowest
-        value by more than 5 % for 5 rounds in a row. ``learn`` calls it in offline training; call it yourself on a
-        loaded model with a loaded replay buffer (and, if it was trained with ``VecNormalize``, its environment set).
+        It has converged when, for 5 rounds of 1,000 gradient steps in a row, no round's mean loss was more than 5 % below
+        the lowest one before. ``learn`` calls it in offline training; call it yourself on a loaded model with a loaded
+        replay buffer (and, if it was trained with ``VecNormalize``, its environment set).
 
         Callbacks see each gradient step as a step in which no environment moves: ``num_timesteps`` does not change, no
         episode ends, rewards are 0. Values are logged at ``num_timesteps`` plus the number of gradient steps. A callback

@@ -14,7 +14,7 @@ def evaluation_mode(network: nn.Module) -> Iterator[None]:
 
     Neither dropout nor batch statistics disturb it then, and its running statistics do not change.
 
-    :param network: the network. A submodule that is in training mode by itself remains in evaluation mode.
+    :param network: the network. A submodule that alone was in training mode is left in evaluation mode.
     """
     was_training = network.training
     if any(module.training for module in network.modules()):

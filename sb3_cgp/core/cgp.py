@@ -268,7 +268,7 @@ class CGP(OffPolicyAlgorithm):
     ) -> SelfCGP:
         """Learn as SB3's algorithms do, and train the policy at the end if its training is offline (:meth:`train_policy`)."""
         super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        # Only if the critics have changed. A loaded model has no buffer if a callback stopped `learn` at its first step.
+        # Only if the critics have changed, and there is data: a callback may have stopped `learn` at its first step
         is_due = self._policy_is_due and self.policy_training == "offline"
         if is_due and self.replay_buffer is not None and self.replay_buffer.size() > 0:
             self.train_policy(callback=callback, progress_bar=progress_bar)

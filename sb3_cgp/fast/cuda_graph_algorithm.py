@@ -23,9 +23,9 @@ class CudaGraphAlgorithm(TransientAttributes, CGP):
     CGP whose gradient steps are recorded as CUDA graphs on a GPU, and replayed.
 
     The recorded function is the core's gradient step itself, on a minibatch that was sampled before. Its losses are read when
-    the log is written, as the host would synchronise with the GPU at every step otherwise; a NaN or infinite loss lets the
-    optimizer skip the step, and is reported at that time. Without a GPU, and with ``Dict`` observations or another optimizer
-    than a fused Adam, steps are carried out as usual.
+    the log is written, as reading them at every step would make the host wait for the GPU. The optimizer skips a step whose
+    loss is NaN or infinite; the error follows when the log is written. Without a GPU, and with ``Dict`` observations or
+    another optimizer than a fused Adam, steps are carried out as usual.
     """
 
     # Graphs, and tensors on the device, which are made anew for a copied or loaded model

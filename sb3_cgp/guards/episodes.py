@@ -48,7 +48,7 @@ class EpisodeGuard(TransientAttributes):
     @contextmanager
     def _beginning_episodes(self, reset_num_timesteps: bool) -> Iterator[None]:
         """Let SB3 reset an environment that has moved, within the context, and end the last episode unless it goes on."""
-        reason = "a training that begins, or goes on in another environment, starts with an episode"
+        reason = "a training that begins, or goes on in another environment, starts with a new episode"
         if self._env_has_moved():
             reason = MOVED if self._own_step is None else "its last step was interrupted before it was stored"
             self._last_obs = None
