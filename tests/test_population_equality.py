@@ -46,6 +46,9 @@ class OneBatch(ReplayBuffer):
     def __init__(self, batch):
         self.batch = batch
 
+    def size(self):
+        return len(self.batch.rewards)
+
     def sample(self, batch_size, env=None):
         assert batch_size == len(self.batch.rewards)
         return self.batch

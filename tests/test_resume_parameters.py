@@ -1,4 +1,4 @@
-"""Frozen parameters stay frozen in a resumed training; optimizers and schedules that `resume` cannot make are refused."""
+"""Frozen parameters stay frozen in a resumed training; optimizers and schedules that `resume` cannot make are named."""
 
 from copy import deepcopy
 
@@ -134,16 +134,23 @@ SCHEDULES = {
 
 
 @pytest.mark.parametrize("name", SCHEDULES)
-def test_a_schedule_that_is_set_on_the_model_is_refused_at_the_next_state_and_warned_of_in_a_saved_model(name, tmp_path):
+def test_a_schedule_that_is_set_on_the_model_and_will_be_lost_is_warned_of(name, tmp_path):
     algorithm, schedule = SCHEDULES[name]
     model = make_model(algorithm, env="CartPole-v1" if algorithm is not CGP else "Pendulum-v1")
-    message = rf"`model.{name}` was set on the model, but .* makes it of `\w+`.* Give these to the constructor"
-    checkpoint = TrainingCheckpointCallback(20, tmp_path / "state")
-    with pytest.raises(ValueError, match=message):
-        model.learn(90, [checkpoint, Do(50, lambda: setattr(model, name, schedule))])
-    assert StateStore(tmp_path / "state").steps() == [20, 40]
+    message = rf"`model.{name}` is not what .*`\w+` make it.*: set these on the model, too"
+    with pytest.warns(UserWarning, match=message):
+        model.learn(90, [TrainingCheckpointCallback(20, tmp_path / "state"), Do(50, lambda: setattr(model, name, schedule))])
     with pytest.warns(UserWarning, match=message):
         model.save(tmp_path / "model")
+
+
+@pytest.mark.parametrize("schedule", [FloatSchedule(1e-5), lambda _: 1e-5])
+@pytest.mark.filterwarnings("error")
+def test_a_schedule_that_agrees_with_the_learning_rate_is_not_warned_of(schedule, tmp_path):
+    model = make_model(CGP)
+    model.learning_rate, model.lr_schedule = 1e-5, schedule
+    model.learn(30, TrainingCheckpointCallback(10, tmp_path / "state"))
+    assert CGP.resume(tmp_path / "state", "Pendulum-v1").lr_schedule(0.5) == 1e-5
 
 
 def test_a_learning_rate_that_is_set_with_its_schedule_is_resumed(tmp_path):

@@ -1,6 +1,5 @@
 """Runs of rl_zoo3 that are interrupted, and resumed in their folders, beside runs that are not."""
 
-import argparse
 import signal
 import subprocess
 import sys
@@ -23,7 +22,6 @@ from sb3_cgp.resumption.logs import cut_monitors
 from sb3_cgp.resumption.store import StateStore
 from sb3_cgp.zoo import registration as zoo
 from sb3_cgp.zoo.resume import main
-from sb3_cgp.zoo.resumed_run import ResumedExperiment
 from sb3_cgp.zoo.run_folders import LOCK_FILE, interpreter
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
@@ -390,18 +388,3 @@ def test_a_process_that_was_killed_is_resumed_by_the_command(number, status, vec
     assert resumed.returncode == 0, output
     assert "Resuming" in output
     assert_same(outcome(tmp_path / "killed"), outcome(tmp_path / "straight"))
-
-
-@pytest.mark.parametrize(
-    ("given", "expected"), [(None, dict(g=5.0, render_mode="rgb_array")), (dict(g=1.0), dict(g=1.0))], ids=["same", "own"]
-)
-def test_evaluations_go_on_in_environments_of_the_runs_arguments(given, expected, tmp_path):
-    """Those of the run's hyperparameters and of its command line together."""
-    names = ["n_timesteps", "eval_freq", "eval_episodes", "save_freq", "seed", "log_interval", "verbose", "n_eval_envs"]
-    text = dict(log_folder=str(tmp_path), tensorboard_log="", trained_agent="", vec_env="dummy", device="cpu")
-    flags = dict(save_replay_buffer=False, progress=False)
-    arguments = dict(algo="cgp", env="Pendulum-v1", env_kwargs=dict(g=5.0), eval_env_kwargs=given, **text, **flags)
-    args = argparse.Namespace(**dict.fromkeys(names, 1), **arguments)
-    experiment = ResumedExperiment(tmp_path, args, dict(env_kwargs=dict(g=5.0, render_mode="rgb_array")))
-    experiment.read_hyperparameters()
-    assert experiment.eval_env_kwargs == expected

@@ -111,7 +111,7 @@ def test_states_are_removed_before_another_process_may_continue_from_them(clock,
     events = []
 
     class Lock:
-        def __init__(self, path):
+        def __init__(self, path, **_):
             events.append("locked")
 
         def acquire(self, timeout):

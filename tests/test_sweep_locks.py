@@ -40,12 +40,23 @@ def test_a_process_says_once_for_whom_it_waits(tmp_path, capsys, is_held):
     assert "Waiting" not in capsys.readouterr().out
 
 
-def test_on_a_file_system_without_locks_nobody_waits(tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.EOPNOTSUPP])
+def test_on_a_file_system_without_locks_nobody_waits(number, tmp_path, monkeypatch):
     def has_none(*_):
-        raise OSError(errno.ENOSYS, "Function not implemented")
+        raise OSError(number, "Function not implemented")
 
+    told = []
     monkeypatch.setattr("fcntl.flock", has_none)
-    monkeypatch.setattr("builtins.print", lambda *_, **__: pytest.fail("waits"))
+    monkeypatch.setattr("builtins.print", lambda text, **_: pytest.fail(text) if "Waiting" in text else told.append(text))
     # Two at once, as after a process that was killed
     with locked([tmp_path]), locked([tmp_path]):
+        assert ["cannot be locked" in text for text in told] == [True, True]
+
+
+def test_another_error_is_raised(tmp_path, monkeypatch):
+    def is_full(*_):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr("fcntl.flock", is_full)
+    with pytest.raises(OSError, match="Input/output error"), locked([tmp_path]):
         pass

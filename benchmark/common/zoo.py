@@ -35,6 +35,8 @@ def read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str
     except OSError as error:
         raise ValueError(f"The file of hyperparameters {conf_file} cannot be read: {error.strerror}") from error
     except (yaml.YAMLError, AttributeError, TypeError) as error:
+        if conf_file is None:
+            raise
         problem = "is no mapping of tasks to hyperparameters"
         raise ValueError(f"The file of hyperparameters {conf_file} {problem}: {error}") from error
     return dict(hyperparams)
@@ -62,7 +64,8 @@ def without_defaults(entry: Mapping[str, Any]) -> dict[str, Any]:
     :return: those that differ; all, for an algorithm that is not known
     """
     register()
-    parameters = inspect.signature(ALGOS[entry["algo"]]).parameters if entry["algo"] in ALGOS else {}
+    algorithm = ALGOS.get(entry.get("algo", ""))
+    parameters = {} if algorithm is None else inspect.signature(algorithm).parameters
     defaults = {name: _each_step(parameter.default) for name, parameter in parameters.items()}
     return {name: value for name, value in entry.items() if name not in defaults or _each_step(value) != defaults[name]}
 

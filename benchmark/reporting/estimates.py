@@ -119,7 +119,7 @@ def cells_of(table: pd.DataFrame, column: str) -> dict[Hashable, np.ndarray]:
     :param column: the column wanted
     :return: an array of each cell's runs, by what they were trained with and their values
     """
-    ordered = without_copies(table.sort_values("cell", kind="stable"))
+    ordered = without_copies(table).sort_values("cell", kind="stable")
     cells = {name: cell.to_numpy(dtype=float) for name, cell in ordered.groupby("trained", sort=False)[column]}
     # The scores of copies that other machines trained differ, so that they are drawn by themselves
     return {(name, *cell): cell for name, cell in cells.items()}

@@ -18,7 +18,7 @@ from typing import Any
 from huggingface_sb3 import EnvironmentName
 
 from benchmark.common.sweep_names import METHODS_FILE, problem_of, sweep_names, sweep_path, sweeps_folder
-from benchmark.common.zoo import EVALUATIONS_PER_RUN, shortened_warm_up
+from benchmark.common.zoo import EVALUATIONS_PER_RUN, shortened_warm_up, without_defaults
 from benchmark.sweeps.entries import base_entry
 from benchmark.sweeps.hyperparameters import problems
 from benchmark.sweeps.runs import Run, checkpoint_interval
@@ -67,11 +67,22 @@ class Sweep:
         return json.loads(json.dumps({"hyperparams": hyperparams, "axes": axes}))
 
     def _is_replaced(self, key: str) -> bool:
-        """Return whether an axis sets a hyperparameter of every method of the file, also of those that were not chosen."""
-        return any(
+        """Return whether axes, or all methods, set a hyperparameter of every method of the file, also of those not chosen."""
+        return self.all_methods_set(key) or any(
             all(key in axis.hyperparams(name, value, method) for value in axis.values for method in self.file.methods)
             for name, axis in self.file.axes.items()
         )
+
+    def all_methods_set(self, key: str) -> bool:
+        """
+        Return whether each method, all defined in the file, has a hyperparameter of its own, which goes before the file's.
+
+        :param key: the hyperparameter
+        :return: whether each has; False if it was given on the command line, which goes before both
+        """
+        methods = self.file.methods
+        is_given = key in self.given
+        return isinstance(methods, dict) and not is_given and all(key in each.hyperparams for each in methods.values())
 
     def runs(self) -> list[Run]:
         """
@@ -278,13 +289,13 @@ def _copies(sweep: Sweep) -> list[tuple[str, ...]]:
     """Return the configurations that have the same hyperparameters on a task, those of the same together."""
     alike: dict[str, dict[str, None]] = {}
     for run in sweep.runs():
-        same = json.dumps([run.task, run.algo, run.hyperparams], sort_keys=True, default=str)
+        same = json.dumps([run.task, without_defaults({"algo": run.algo, **run.hyperparams})], sort_keys=True, default=str)
         alike.setdefault(same, {})[run.configuration] = None
     return list(dict.fromkeys(tuple(names) for names in alike.values() if len(names) > 1))
 
 
 def _replaced_hyperparams(sweep: Sweep) -> dict[str, str]:
-    """Return the hyperparameters for all methods that axes replace in every run, with the axes in words."""
+    """Return the hyperparameters for all methods that axes or the methods replace in every run, with these in words."""
     file, runs = sweep.file, sweep.runs()
     found = {}
     for key in file.hyperparams:
@@ -292,7 +303,9 @@ def _replaced_hyperparams(sweep: Sweep) -> dict[str, str]:
             [axis for axis, value in run.settings.items() if key in file.axes[axis].hyperparams(axis, value, run.method)]
             for run in runs
         ]
-        if all(setting):
+        if sweep.all_methods_set(key):
+            found[key] = "each method"
+        elif all(setting):
             found[key] = " or ".join(f"the axis {axis!r}" for axis in dict.fromkeys(itertools.chain(*setting)))
     return found
 

@@ -1,10 +1,14 @@
 """Locks on the folders of runs: a process that was taken for lost may still write to them."""
 
+import errno
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from filelock import FileLock, Timeout
+
+# Of a file system without locks
+NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 
 
 @contextmanager
@@ -27,8 +31,10 @@ def locked(folders: Sequence[Path]) -> Iterator[None]:
                 told = f"Waiting for the process that holds {path}, which may be suspended: `fuser {path}` names it"
                 print(told, flush=True)
                 lock.acquire()
-            except OSError:
-                # A file system without locks
+            except OSError as error:
+                if error.errno not in NO_LOCKS:
+                    raise
+                print(f"Warning: {folder} cannot be locked ({error}): make sure that no other process uses it.", flush=True)
                 continue
             stack.callback(lock.release)
         yield

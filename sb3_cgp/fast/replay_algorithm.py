@@ -149,8 +149,8 @@ class LeanReplayAlgorithm(OffPolicyAlgorithm):
         :param kwargs: the algorithm's own arguments
         :raises ValueError: if there is no data
         """
-        is_filled = self.replay_buffer is not None and self.replay_buffer.size() > 0
-        require(is_filled, "replay_buffer", self.replay_buffer, "filled, by `learn` or `load_replay_buffer`")
+        n_filled = 0 if self.replay_buffer is None else self.replay_buffer.size()
+        require(n_filled > 0, "replay_buffer.size()", n_filled, "above 0: fill it by `learn` or `load_replay_buffer`")
         # A callback may have changed them
         self._set_n_step_returns()
         super().train(*args, **kwargs)

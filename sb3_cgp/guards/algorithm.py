@@ -238,7 +238,8 @@ class GuardedAlgorithm(TransitionGuard, EpisodeGuard, LearningStartsGuard, Norma
         """
         if action_noise is not None:
             self._fit_action_noise()
-        return super().collect_rollouts(env, callback, train_freq, replay_buffer, self.action_noise, *args, **kwargs)
+            action_noise = self.action_noise
+        return super().collect_rollouts(env, callback, train_freq, replay_buffer, action_noise, *args, **kwargs)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         super()._update_current_progress_remaining(num_timesteps, total_timesteps)

@@ -14,6 +14,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_cgp.guards.observation_fit import RETURN_EVERY_KEY
+
 OLD_API = (
     "The environment has the API of Gym before version 0.26. Change it, or wrap it in `shimmy.GymV21CompatibilityV0(env=env)`."
 )
@@ -97,7 +99,7 @@ def explain(error: Exception, model: OffPolicyAlgorithm) -> str | None:
     if isinstance(error, KeyError):
         is_observation = frame.f_globals.get("__name__") == SubprocVecEnv.__module__
         missing = f"An environment returned an observation without the key {error} of its space, at environment step"
-        return f"{missing} {model.num_timesteps}. It was not stored." if is_observation else None
+        return f"{missing} {model.num_timesteps}. It was not stored. {RETURN_EVERY_KEY}" if is_observation else None
     reward = _explain_reward(error, frame)
     if reward is not None:
         return f"The environment returned a reward that is not a number at environment step {model.num_timesteps}{reward}."

@@ -239,6 +239,9 @@ class TransitionGuard(OffPolicyAlgorithm):
         ended = [info for info, done in zip(infos, dones, strict=True) if done]
         final = [info["terminal_observation"] for info in ended if info.get("terminal_observation") is not None]
         self._check(Transition(self.num_timesteps, self.observation_space, observations, rewards, final, self.n_envs))
+        if normalizer is None:
+            for observation in final:
+                check_integers("terminal observation", observation, self.observation_space, self.num_timesteps)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _check(self, transition: Transition) -> None:

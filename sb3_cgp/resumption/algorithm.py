@@ -4,7 +4,6 @@ import copy
 import io
 import os
 import signal
-import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,7 +26,7 @@ from sb3_cgp.resumption.callbacks import TrainingCheckpointCallback, checkpoints
 from sb3_cgp.resumption.locks import FolderLock
 from sb3_cgp.resumption.logs import continued_logger
 from sb3_cgp.resumption.model import ResumableModel
-from sb3_cgp.resumption.parameters import freeze_parameters, lost_schedule
+from sb3_cgp.resumption.parameters import freeze_parameters, warn_of_lost_schedules
 from sb3_cgp.resumption.progress_bars import show_whole_training
 from sb3_cgp.resumption.replay_buffers import fill_replay_buffer
 from sb3_cgp.resumption.state import begin_new_episode, check_fits
@@ -159,16 +158,14 @@ class ResumableAlgorithm(ResumableModel):
         """
         Save all the attributes of the object and the model parameters in a zip-file.
 
-        The file is written completely or not at all. A warning names a schedule that was set on the model, and is not saved.
+        The file is written completely or not at all. A warning names a schedule that was set on the model and will be lost.
 
         :param path: path to the file where the rl agent should be saved
         :param exclude: name of parameters that should be excluded in addition to the default ones
         :param include: name of parameters that might be excluded but should be included anyway
         :raises OSError: if it cannot be written; an existing file is then not changed
         """
-        lost = lost_schedule(self)
-        if lost is not None:
-            warnings.warn(lost, stacklevel=2)
+        warn_of_lost_schedules(self)
         with _whole(path, ".zip") as file:
             super().save(file, exclude, include)
 

@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_cgp.common.rules import require, require_count
 from sb3_cgp.resumption.callback_states import initial_attributes, iter_callbacks
 from sb3_cgp.resumption.model import ResumableModel
-from sb3_cgp.resumption.parameters import check_savable_training
+from sb3_cgp.resumption.parameters import check_optimizers
 from sb3_cgp.resumption.replay_buffers import check_savable
 from sb3_cgp.resumption.signals import StopSignals, end_training
 from sb3_cgp.resumption.state import gather, restore
@@ -40,7 +40,7 @@ class TrainingCheckpointCallback(BaseCallback):
     :param verbose: Verbosity level: 0 for no output, 2 for indicating when a state is saved
     :raises ValueError: if an argument is out of its range, or, when the training starts, if the folder holds the states of
         another training, the model has no environment, or the replay buffer cannot be saved; then, or when a state is due,
-        if an optimizer or a schedule was set on the model that a resumed training would not have
+        if an optimizer was set on the model that a resumed training would not have
     :raises FolderInUseError: when the training starts, if another training uses the folder
     :raises OSError: when the training starts or a state is due, if the folder cannot be written to
     """
@@ -93,7 +93,7 @@ class TrainingCheckpointCallback(BaseCallback):
         allowed = "set, by `set_env` or the argument `env` of `load`, where the training is saved"
         require(self.model.env is not None, "env", None, allowed)
         check_savable(self.model._ensure_replay_buffer())
-        check_savable_training(self.model)
+        check_optimizers(self.model)
         self._store = StateStore(self._folder, self.keep)
         # `prepare` names a folder that cannot be made
         with suppress(OSError):

@@ -15,12 +15,6 @@ from sb3_cgp.resumption.locks import FolderLock
 
 State = dict[str, Any]
 
-# What `_setup_model` makes of arguments, so that SB3's `load` replaces what is saved of it
-SCHEDULES = {
-    "lr_schedule": "`learning_rate`",
-    "exploration_schedule": "`exploration_initial_eps`, `exploration_final_eps` and `exploration_fraction`",
-}
-
 
 @dataclass(frozen=True)
 class RunningTraining:
@@ -58,19 +52,6 @@ class ResumableModel(TransientAttributes):
     _training_started_at: int = 0
     # Whether the last training ended by itself or by a callback, not by a signal or an error
     _training_has_ended: bool = False
-    # Those of `SCHEDULES` that are made of the arguments
-    _made_schedules: Mapping[str, Any] = MappingProxyType({})
-
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        self._note_schedules()
-
-    def _setup_lr_schedule(self) -> None:
-        super()._setup_lr_schedule()
-        self._note_schedules()
-
-    def _note_schedules(self) -> None:
-        self._made_schedules = {name: value for name, value in vars(self).items() if name in SCHEDULES}
 
     def _note_training(self, **changes: Any) -> None:
         """Change what is known of the running training."""
@@ -110,4 +91,4 @@ class ResumableModel(TransientAttributes):
         return self.replay_buffer
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "resumption", "saved_to", "_made_schedules"]
+        return [*super()._excluded_save_params(), "resumption", "saved_to"]

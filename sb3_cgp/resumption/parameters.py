@@ -1,14 +1,27 @@
 """What SB3's zip does not hold of a training: which parameters are frozen, and optimizers and schedules set on a model."""
 
-from collections.abc import Collection
+import warnings
+from collections.abc import Callable, Collection
 from typing import Any
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
 from sb3_cgp.common.random_state import preserved_random_state
-from sb3_cgp.resumption.model import SCHEDULES, ResumableModel
+from sb3_cgp.resumption.model import ResumableModel
+
+# What SB3's `_setup_model` makes of arguments, and how
+SCHEDULES: dict[str, tuple[str, Callable[[Any], Callable[[float], float]]]] = {
+    "lr_schedule": ("`learning_rate`", lambda model: FloatSchedule(model.learning_rate)),
+    "exploration_schedule": (
+        "`exploration_initial_eps`, `exploration_final_eps` and `exploration_fraction`",
+        lambda model: LinearSchedule(model.exploration_initial_eps, model.exploration_final_eps, model.exploration_fraction),
+    ),
+}
+# Where schedules are compared
+REMAINING = (1.0, 0.75, 0.5, 0.25, 0.0)
 
 
 def frozen_parameters(policy: BasePolicy) -> list[str]:
@@ -32,37 +45,29 @@ def freeze_parameters(policy: BasePolicy, names: Collection[str]) -> None:
         parameter.requires_grad_(name not in names)
 
 
-def lost_schedule(model: ResumableModel) -> str | None:
+def warn_of_lost_schedules(model: ResumableModel) -> None:
     """
-    Say which schedule was set on a model, as SB3's ``load`` makes it anew of the arguments.
+    Warn of a schedule that was set on a model, as SB3's ``load`` makes it anew of the arguments.
 
     :param model: the model
-    :return: a sentence with the remedy; None if no schedule is lost
     """
-    for name, arguments in SCHEDULES.items():
-        if vars(model).get(name) is not model._made_schedules.get(name):
-            return (
-                f"`model.{name}` was set on the model, but a model that is loaded or resumed makes it of {arguments}. Give "
-                "these to the constructor; a learning rate that changes is a function of the progress remaining, from 1 to 0."
+    for name, (arguments, make) in SCHEDULES.items():
+        schedule = vars(model).get(name)
+        if schedule is not None and any(schedule(remaining) != make(model)(remaining) for remaining in REMAINING):
+            warnings.warn(
+                f"`model.{name}` is not what {arguments} make it, of which a model that is loaded or resumed makes it: set "
+                "these on the model, too. A learning rate may be a function of the progress remaining, from 1 to 0.",
+                stacklevel=3,
             )
-    return None
 
 
-def check_savable_training(model: ResumableModel) -> None:
+def check_optimizers(model: ResumableModel) -> None:
     """
-    Refuse what was set on a model and differs from what ``resume`` makes: schedules and optimizers.
+    Refuse an optimizer that was set on a model and is another one than that which ``resume`` makes. Check each of them once.
 
     :param model: the model
-    :raises ValueError: naming the schedule or the optimizer, and the remedy
+    :raises ValueError: naming the optimizer, and the remedy
     """
-    lost = lost_schedule(model)
-    if lost is not None:
-        raise ValueError(lost)
-    _check_optimizers(model)
-
-
-def _check_optimizers(model: ResumableModel) -> None:
-    """Refuse an optimizer that was set on a model and is another one than that which ``resume`` makes. Check each once."""
     names = [name for name in model._get_torch_save_params()[0] if name.endswith(".optimizer")]
     optimizers = {name: recursive_getattr(model, name) for name in names}
     if optimizers == model._training.checked_optimizers:

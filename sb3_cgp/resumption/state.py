@@ -24,7 +24,7 @@ from sb3_cgp.resumption.callback_states import callback_states, restore_callback
 from sb3_cgp.resumption.environments import restore_environment, state_and_obstacles
 from sb3_cgp.resumption.logs import tensorboard_folder
 from sb3_cgp.resumption.model import ResumableModel, State
-from sb3_cgp.resumption.parameters import check_savable_training, frozen_parameters
+from sb3_cgp.resumption.parameters import check_optimizers, frozen_parameters
 from sb3_cgp.resumption.plain_data import NUMERIC, plain_attributes, set_plain_attributes
 from sb3_cgp.resumption.replay_buffers import replay_buffer_state
 
@@ -40,10 +40,10 @@ def gather(model: ResumableModel, callback: BaseCallback) -> State:
     :param model: the model
     :param callback: the training's callbacks
     :return: the state; it may share arrays with the training, which will change them
-    :raises ValueError: if an optimizer or a schedule was set on the model that a resumed training would not have
+    :raises ValueError: if an optimizer was set on the model that a resumed training would not have
     """
     assert model.env is not None
-    check_savable_training(model)
+    check_optimizers(model)
     model._before_saving_state()
     zipped = io.BytesIO()
     model.save(zipped)
