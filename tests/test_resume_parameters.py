@@ -153,6 +153,12 @@ def test_a_schedule_that_agrees_with_the_learning_rate_is_not_warned_of(schedule
     assert CGP.resume(tmp_path / "state", "Pendulum-v1").lr_schedule(0.5) == 1e-5
 
 
+@pytest.mark.parametrize("rate", [1e-3, "lin_1e-3", lambda remaining: 1e-3 * remaining], ids=["number", "text", "function"])
+@pytest.mark.filterwarnings("error")
+def test_a_learning_rate_in_each_form_is_saved_without_a_warning(rate, tmp_path):
+    make_model(CGP, learning_rate=rate).save(tmp_path / "model")
+
+
 def test_a_learning_rate_that_is_set_with_its_schedule_is_resumed(tmp_path):
     """By SB3's private method."""
 

@@ -7,14 +7,15 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import recursive_getattr
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_cgp.common.random_state import preserved_random_state
+from sb3_cgp.common.sb3_arguments import as_schedule
 from sb3_cgp.resumption.model import ResumableModel
 
 # What SB3's `_setup_model` makes of arguments, and how
 SCHEDULES: dict[str, tuple[str, Callable[[Any], Callable[[float], float]]]] = {
-    "lr_schedule": ("`learning_rate`", lambda model: FloatSchedule(model.learning_rate)),
+    "lr_schedule": ("`learning_rate`", lambda model: as_schedule(model.learning_rate)),
     "exploration_schedule": (
         "`exploration_initial_eps`, `exploration_final_eps` and `exploration_fraction`",
         lambda model: LinearSchedule(model.exploration_initial_eps, model.exploration_final_eps, model.exploration_fraction),
