@@ -1,5 +1,6 @@
 """What tests share: one thread; the CPU, so that the same is tested with and without a GPU; fixtures of several modules."""
 
+import errno
 import os
 import shutil
 import signal
@@ -85,6 +86,19 @@ def short_policy_training(monkeypatch):
 def short_episodes(monkeypatch):
     """End Pendulum-v1's episodes after 25 steps rather than 200: evaluations are most of a tiny training's time otherwise."""
     monkeypatch.setattr(gym.spec("Pendulum-v1"), "max_episode_steps", 25)
+
+
+@pytest.fixture
+def fail_to_lock(monkeypatch):
+    """Let each lock of a file fail by an error; by default that of a file system without locks."""
+
+    def fail(number=errno.ENOSYS):
+        def flock(*_):
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr("fcntl.flock", flock)
+
+    return fail
 
 
 @pytest.fixture

@@ -177,6 +177,13 @@ def test_an_extractor_that_caches_a_tensor_learns():
     assert model.actor.features_extractor.cache is not None
 
 
+def make_on(space):
+    env = Located()
+    env.observation_space = space
+    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
+    return GuardedTD3(policy, DummyVecEnv([lambda: env]), **SMALL)
+
+
 @pytest.mark.parametrize(
     ("space", "name"),
     [
@@ -186,11 +193,8 @@ def test_an_extractor_that_caches_a_tensor_learns():
     ids=str,
 )
 def test_a_scalar_observation_is_refused_with_the_remedy(space, name):
-    env = Located()
-    env.observation_space = space
-    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
     with pytest.raises(ValueError, match=rf"`{name}` is Box\(.*\), but must be of a shape .* such as \(1,\)"):
-        GuardedTD3(policy, DummyVecEnv([lambda: env]), **SMALL)
+        make_on(space)
 
 
 @pytest.mark.parametrize(
@@ -203,11 +207,8 @@ def test_a_scalar_observation_is_refused_with_the_remedy(space, name):
     ids=str,
 )
 def test_a_discrete_observation_that_sb3_cannot_encode_is_refused_with_the_remedy(space, remedy):
-    env = Located()
-    env.observation_space = space
-    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
     with pytest.raises(ValueError, match=rf"(?s)`observation_space.* is .*Discrete\(.*, but must be {remedy}"):
-        GuardedTD3(policy, DummyVecEnv([lambda: env]), **SMALL)
+        make_on(space)
 
 
 @pytest.mark.parametrize(

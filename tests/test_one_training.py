@@ -1,7 +1,6 @@
 """Folders of states that belong to one training at a time, states on other kinds of buffers, and copies of models."""
 
 import copy
-import errno
 import gc
 import os
 import pickle
@@ -86,15 +85,12 @@ def test_another_process_is_refused_and_a_killed_one_does_not_block(folder):
 
 
 @pytest.mark.parametrize("is_copied", [True, False])
-def test_on_a_file_system_without_locks_nothing_is_left_that_blocks(is_copied, tmp_path, monkeypatch):
-    def has_none(*_):
-        raise OSError(errno.ENOSYS, "Function not implemented")
-
+def test_on_a_file_system_without_locks_nothing_is_left_that_blocks(is_copied, tmp_path, fail_to_lock):
     if is_copied:
         FolderLock(tmp_path).acquire()
         gc.collect()
         assert (tmp_path / ".lock").exists()
-    monkeypatch.setattr("fcntl.flock", has_none)
+    fail_to_lock()
     for _ in range(2):
         # A killed process releases nothing
         lock = FolderLock(tmp_path)

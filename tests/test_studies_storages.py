@@ -1,7 +1,6 @@
 """Storages of studies: patience with a database that is away, those that are none, and Optuna's proxy."""
 
 import copy
-import errno
 import os
 import pickle
 import signal
@@ -191,11 +190,8 @@ def test_a_file_with_all_tables_is_opened_without_the_lock(tmp_path, monkeypatch
     assert open_storage(url).get_all_studies() == []
 
 
-def test_a_file_on_a_file_system_without_locks_is_opened(tmp_path, monkeypatch):
-    def has_none(*_):
-        raise OSError(errno.ENOSYS, "Function not implemented")
-
-    monkeypatch.setattr("fcntl.flock", has_none)
+def test_a_file_on_a_file_system_without_locks_is_opened(tmp_path, fail_to_lock):
+    fail_to_lock()
     # Created by a process that was killed
     (tmp_path / "studies.db.lock").touch()
     start = time.monotonic()

@@ -41,22 +41,16 @@ def test_a_process_says_once_for_whom_it_waits(tmp_path, capsys, is_held):
 
 
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.EOPNOTSUPP])
-def test_on_a_file_system_without_locks_nobody_waits(number, tmp_path, monkeypatch):
-    def has_none(*_):
-        raise OSError(number, "Function not implemented")
-
+def test_on_a_file_system_without_locks_nobody_waits(number, tmp_path, monkeypatch, fail_to_lock):
     told = []
-    monkeypatch.setattr("fcntl.flock", has_none)
+    fail_to_lock(number)
     monkeypatch.setattr("builtins.print", lambda text, **_: pytest.fail(text) if "Waiting" in text else told.append(text))
     # Two at once, as after a process that was killed
     with locked([tmp_path]), locked([tmp_path]):
         assert ["cannot be locked" in text for text in told] == [True, True]
 
 
-def test_another_error_is_raised(tmp_path, monkeypatch):
-    def is_full(*_):
-        raise OSError(errno.EIO, "Input/output error")
-
-    monkeypatch.setattr("fcntl.flock", is_full)
+def test_another_error_is_raised(tmp_path, fail_to_lock):
+    fail_to_lock(errno.EIO)
     with pytest.raises(OSError, match="Input/output error"), locked([tmp_path]):
         pass

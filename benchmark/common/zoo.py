@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import inspect
+import json
 import os
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -56,18 +57,19 @@ def random_steps(algo: str, hyperparams: Mapping[str, Any]) -> int:
     return int(hyperparams.get("learning_starts", default))
 
 
-def without_defaults(entry: Mapping[str, Any]) -> dict[str, Any]:
+def without_defaults(entry: Mapping[str, Any]) -> str:
     """
-    Return the hyperparameters of a run without those that are its algorithm's defaults.
+    Return a text that is the same for hyperparameters of a run that differ only by their algorithm's defaults.
 
     :param entry: the hyperparameters, and "algo", the algorithm's name in rl_zoo3
-    :return: those that differ; all, for an algorithm that is not known
+    :return: those that are no defaults, as JSON; all, for an algorithm that is not known
     """
     register()
     algorithm = ALGOS.get(entry.get("algo", ""))
     parameters = {} if algorithm is None else inspect.signature(algorithm).parameters
     defaults = {name: _each_step(parameter.default) for name, parameter in parameters.items()}
-    return {name: value for name, value in entry.items() if name not in defaults or _each_step(value) != defaults[name]}
+    own = {name: value for name, value in entry.items() if name not in defaults or _each_step(value) != defaults[name]}
+    return json.dumps(own, sort_keys=True, default=str)
 
 
 def _each_step(value: Any) -> Any:

@@ -1,6 +1,5 @@
 """Copies of one run, in several studies or for several values of an axis that its method ignores: they count once."""
 
-import json
 from typing import Any
 
 import pandas as pd
@@ -24,9 +23,7 @@ class Configurations:
         # rl_zoo3 takes a second to import, and only defaults need it
         from benchmark.common.zoo import without_defaults
 
-        self._texts = {
-            place: json.dumps(without_defaults(entry), sort_keys=True) for place, entry in entries_by_task(description).items()
-        }
+        self._texts = {place: without_defaults(entry) for place, entry in entries_by_task(description).items()}
 
     def of(self, record: Record, default: str) -> str:
         """

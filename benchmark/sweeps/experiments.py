@@ -287,9 +287,9 @@ def load_sweep(name: str, overrides: dict[str, Any] | None = None, methods: Sequ
 
 def _copies(sweep: Sweep) -> list[tuple[str, ...]]:
     """Return the configurations that have the same hyperparameters on a task, those of the same together."""
-    alike: dict[str, dict[str, None]] = {}
+    alike: dict[tuple[str, str], dict[str, None]] = {}
     for run in sweep.runs():
-        same = json.dumps([run.task, without_defaults({"algo": run.algo, **run.hyperparams})], sort_keys=True, default=str)
+        same = run.task, without_defaults({"algo": run.algo, **run.hyperparams})
         alike.setdefault(same, {})[run.configuration] = None
     return list(dict.fromkeys(tuple(names) for names in alike.values() if len(names) > 1))
 

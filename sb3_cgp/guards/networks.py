@@ -125,11 +125,11 @@ def try_networks(model: OffPolicyAlgorithm) -> None:
 
 def _check_initialised(policy: th.nn.Module) -> None:
     """Refuse parameters of lazy modules, of which each network and its target would make others at their first call."""
+    allowed = (
+        "initialised when the model is made: give its module the sizes, as in `nn.Linear(n, 8)` for `nn.LazyLinear(8)`, "
+        "or pass an observation through the features extractor in its constructor"
+    )
     for name, parameter in policy.named_parameters():
-        allowed = (
-            "initialised when the model is made: give its module the sizes, as in `nn.Linear(n, 8)` for `nn.LazyLinear(8)`, "
-            "or pass an observation through the features extractor in its constructor"
-        )
         require(not is_lazy(parameter), f"policy.{name}", parameter, allowed)
 
 

@@ -30,7 +30,7 @@ def check_shape(name: str, values: Any, space: spaces.Space, n_envs: int | None,
                 f"The environment returned an incomplete {name} at environment step {timestep}: {has}, where its space has "
                 f"the keys {list(by_key(space))}. It was not stored. {RETURN_EVERY_KEY}"
             )
-        part, which = (values, name) if key is None else (values[key], f"{name} `{key}`")
+        part, which = _part(values, name, key)
         shape, expected = np.shape(part), (*batch, *(subspace.shape or ()))
         # NumPy may drop leading axes of length 1, or add them: no number is lost or repeated
         if shape != expected and _without_leading_ones(shape) != _without_leading_ones(expected):
@@ -49,8 +49,13 @@ def check_integers(name: str, values: Any, space: spaces.Space, timestep: int) -
     """
     for key, subspace in by_key(space).items():
         if subspace.dtype is not None and subspace.dtype.kind in "bui":
-            part, which = (values, name) if key is None else (values[key], f"{name} `{key}`")
+            part, which = _part(values, name, key)
             _check_range(which, np.asarray(part), subspace, timestep)
+
+
+def _part(values: Any, name: str, key: str | None) -> tuple[Any, str]:
+    """Return the values of a key, and their name; None is the key of a space without keys."""
+    return (values, name) if key is None else (values[key], f"{name} `{key}`")
 
 
 def wrong_shape(name: str, shape: tuple[int, ...], expected: tuple[int, ...], timestep: int) -> ValueError:

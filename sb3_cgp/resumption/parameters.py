@@ -54,7 +54,10 @@ def warn_of_lost_schedules(model: ResumableModel) -> None:
     """
     for name, (arguments, make) in SCHEDULES.items():
         schedule = vars(model).get(name)
-        if schedule is not None and any(schedule(remaining) != make(model)(remaining) for remaining in REMAINING):
+        if schedule is None:
+            continue
+        made = make(model)
+        if any(schedule(remaining) != made(remaining) for remaining in REMAINING):
             warnings.warn(
                 f"`model.{name}` is not what {arguments} make it, of which a model that is loaded or resumed makes it: set "
                 "these on the model, too. A learning rate may be a function of the progress remaining, from 1 to 0.",
