@@ -56,14 +56,17 @@ def open_ledger(args: argparse.Namespace) -> Ledger:
 
     :param args: the command line
     :return: the study
-    :raises ValueError: if an option is wrong, or the storage holds no such study
+    :raises ValueError: if an option is wrong, the storage holds no such study, or another version of sb3-cgp began it
     """
     check_grace(args.beat, args.grace)
     storage = patiently(open_storage, args.storage, create=False)
     names = optuna.get_all_study_names(storage)
     allowed = f"a study that benchmark.sweep has begun in this storage, which holds {', '.join(names) or 'none'}"
     require(args.study in names, "study", args.study, allowed)
-    return Ledger(storage, args.study, args.grace)
+    ledger = Ledger(storage, args.study, args.grace)
+    # Refuses the runs of another version before any is claimed
+    ledger.recover()
+    return ledger
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -1,5 +1,7 @@
 """A study's settings: with which it is opened again, and how trials show them."""
 
+import json
+
 import pytest
 from ledgers import look_for, open_ledger, trials_of
 from optuna.storages import InMemoryStorage, RDBStorage
@@ -7,10 +9,11 @@ from optuna.trial import TrialState
 from studies import GRACE, Clock, make_sweep
 from tunings import arguments, tuner_of
 
-from benchmark import tune
+from benchmark import tune, worker
 from benchmark.sweeps.experiments import Sweep
+from benchmark.sweeps.groups import GROUP_RUNS, Group
 from benchmark.sweeps.studies import Ledger
-from benchmark.sweeps.study_trials import KEY
+from benchmark.sweeps.study_trials import KEY, RUN
 from benchmark.sweeps.sweep_files import SweepFile
 from benchmark.sweeps.validation import SweepError
 
@@ -75,6 +78,39 @@ def test_a_study_of_an_earlier_version_gets_further_methods():
     ledger.open(make_sweep(["Good"]), {"experiment": "tiny"})
     open_ledger(storage, Clock(), methods=["Other"], seeds=2)
     assert len(ledger.trials()) == 4
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda run: run | {"tuned": False}, "unexpected keyword argument 'tuned'"),
+        (lambda run: {name: value for name, value in run.items() if name != "steps"}, "missing 1 .* argument: 'steps'"),
+    ],
+    ids=["more", "fewer"],
+)
+def test_runs_that_another_version_described_are_refused_in_words(change, message, tmp_path, capsys):
+    url = f"sqlite:///{tmp_path}/studies.db"
+    storage = RDBStorage(url)
+    ledger = open_ledger(storage, Clock())
+    for trial in ledger.trials():
+        storage.set_trial_user_attr(trial._trial_id, RUN, change(trial.user_attrs[RUN]))
+    message = rf"Trial 0 of the study: holds a run of another version of sb3-cgp \(.*{message}.*--study"
+    for read in (lambda: open_ledger(storage, Clock()), ledger.recover, ledger.description, lambda: ledger.claim("worker")):
+        with pytest.raises(SweepError, match=message):
+            read()
+    with pytest.raises(SystemExit, match=f"Error: {message}"):
+        worker.main(["--study", "study", "--storage", url, "--logs", str(tmp_path)])
+
+
+def test_a_population_that_another_version_described_is_refused(tmp_path):
+    group = Group.of(tmp_path, make_sweep(["Good"]).runs())
+    group.write()
+    assert Group.read(group.folder) == group
+    described = json.loads((group.folder / GROUP_RUNS).read_text())
+    described[0]["tuned"] = False
+    (group.folder / GROUP_RUNS).write_text(json.dumps(described))
+    with pytest.raises(SweepError, match=rf"{GROUP_RUNS}: holds a run of another version of sb3-cgp .*'tuned'"):
+        Group.read(group.folder)
 
 
 def test_an_entry_that_is_edited_in_between_is_refused(tmp_path, monkeypatch):

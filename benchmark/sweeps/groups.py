@@ -35,7 +35,7 @@ from benchmark.sweeps.run import has_state, run_folder
 from benchmark.sweeps.runs import Run
 from benchmark.sweeps.sharing import common_settings
 from benchmark.sweeps.studies import Ledger
-from benchmark.sweeps.study_trials import KEY, OUTCOME, POPULATION, RUN, WORKER, Claim, owned
+from benchmark.sweeps.study_trials import KEY, OUTCOME, POPULATION, WORKER, Claim, owned, run_of
 from sb3_cgp.common.files import write_atomically
 from sb3_cgp.resumption.store import StateStore
 from sb3_cgp.zoo.folders import state_folder
@@ -113,8 +113,10 @@ class Group:
 
         :param folder: the population's folder
         :return: the group
+        :raises SweepError: if another version of sb3-cgp described its runs, by other fields
         """
-        return cls(folder, [Run(**fields) for fields in json.loads((folder / GROUP_RUNS).read_bytes())])
+        path = folder / GROUP_RUNS
+        return cls(folder, [Run.from_fields(described, path) for described in json.loads(path.read_bytes())])
 
     def write(self) -> None:
         """Write the runs to the group's folder, for the process that goes on with it."""
@@ -210,7 +212,7 @@ class Groups:
         common: dict[int, str] = {}
         for trial in own if self._size > 1 else ():
             if trial.number not in begun and trial.number not in alone and not _is_dissolved(attempts[trial.user_attrs[KEY]]):
-                settings = common_settings(_run(trial))
+                settings = common_settings(run_of(trial))
                 common |= {} if settings is None else {trial.number: settings}
         seen = set()
         for index, trial in enumerate(waiting):
@@ -235,10 +237,10 @@ class Groups:
         if name is None or not (self._folder / FOLDER / name / GROUP_RUNS).is_file():
             return None
         group = Group.read(self._folder / FOLDER / name)
-        return group if _run(trial) in group.runs and StateStore(group.states).steps() else None
+        return group if run_of(trial) in group.runs and StateStore(group.states).steps() else None
 
     def _has_state(self, trial: FrozenTrial) -> bool:
-        run = _run(trial)
+        run = run_of(trial)
         return has_state(run, run_folder(self._logs, self._study, run))
 
 
@@ -249,10 +251,6 @@ def _is_dissolved(attempts: Sequence[FrozenTrial]) -> bool:
 
 def _as_json(runs: Sequence[Run]) -> bytes:
     return json.dumps([asdict(run) for run in runs]).encode()
-
-
-def _run(trial: FrozenTrial) -> Run:
-    return Run(**trial.user_attrs[RUN])
 
 
 def _names(trials: Sequence[FrozenTrial]) -> dict[str, str | None]:

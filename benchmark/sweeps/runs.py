@@ -1,11 +1,12 @@
 """The runs of a sweep, and their description."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from benchmark.common.records import configuration_in_words, run_key
 from benchmark.sweeps.sweep_files import Hyperparams
+from benchmark.sweeps.validation import SweepError
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,22 @@ class Run:
     evaluation_episodes: int
     checkpoint_interval: int
     gym_packages: list[str] = field(default_factory=list)
+
+    @classmethod
+    def from_fields(cls, described: Mapping[str, Any], place: object) -> "Run":
+        """
+        Return the run that was described by ``dataclasses.asdict``.
+
+        :param described: the values of its fields
+        :param place: the file or the trial that holds them, for the error
+        :return: the run
+        :raises SweepError: if they are not the fields of a run, as another version of sb3-cgp may have had others
+        """
+        try:
+            return cls(**described)
+        except TypeError as error:
+            remedy = "Go on with the version that began the study, or begin another one by --study"
+            raise SweepError(place, "", f"holds a run of another version of sb3-cgp ({error}). {remedy}") from error
 
     @property
     def configuration(self) -> str:

@@ -41,7 +41,6 @@ from benchmark.sweeps.study_trials import (
     OUTCOME,
     POPULATION,
     PROCESSORS,
-    RUN,
     SHARED,
     STOPPED,
     SWEEP,
@@ -52,6 +51,7 @@ from benchmark.sweeps.study_trials import (
     distributions_of,
     owned,
     params_of,
+    run_of,
 )
 from benchmark.sweeps.trial_writer import TrialWriter
 from benchmark.sweeps.validation import SweepError
@@ -105,18 +105,21 @@ class Ledger(TrialWriter):
         # Optuna fixes the values that a study's parameters can have
         if trials and trials[0].distributions != self._distributions:
             raise self._refusal("", "has other methods, tasks or axes")
-        present = {trial.user_attrs[KEY]: trial.user_attrs[RUN] for trial in trials}
+        present = [run_of(trial) for trial in trials]
+        by_key = {run.key: run for run in present}
         # Further seeds of a configuration must have its hyperparameters, too
-        of_cells = {(run["task"], Run(**run).configuration): run for run in present.values()}
+        of_cells = {(run.task, run.configuration): run for run in present}
         for run in runs:
-            was, now = present.get(run.key, of_cells.get((run.task, run.configuration))), json.loads(json.dumps(asdict(run)))
+            earlier = by_key.get(run.key, of_cells.get((run.task, run.configuration)))
+            if earlier is None:
+                continue
+            was, now = asdict(earlier), json.loads(json.dumps(asdict(run)))
             # Hyperparameters last, as the number of random steps may follow from the number of steps
-            names = sorted(now.keys() - {"seed"}, key=lambda name: (name == "hyperparams", name))
-            name = None if was is None else next((name for name in names if was.get(name) != now[name]), None)
-            if was is not None and name is not None:
-                raise self._refusal(name, f"was {was.get(name)!r} and is now {now[name]!r} for {run.key}")
+            for name in sorted(now.keys() - {"seed"}, key=lambda name: (name == "hyperparams", name)):
+                if was[name] != now[name]:
+                    raise self._refusal(name, f"was {was[name]!r} and is now {now[name]!r} for {run.key}")
         for name in ("steps", "evaluation_interval", "evaluation_episodes") if trials else ():
-            before, after = trials[0].user_attrs[RUN][name], getattr(runs[0], name)
+            before, after = getattr(present[0], name), getattr(runs[0], name)
             if before != after:
                 raise self._refusal(name, f"was {before!r} and is now {after!r}")
 
@@ -201,7 +204,7 @@ class Ledger(TrialWriter):
         for trial in silent:
             self._end(self._id(trial), TrialState.FAIL, outcome=LOST)
         trials = self.trials() if silent else trials
-        self.enqueue_missing((Run(**trial.user_attrs[RUN]) for trial in trials), trials)
+        self.enqueue_missing(map(run_of, trials), trials)
 
     def claim(
         self, worker: str, trials: Iterable[FrozenTrial] | None = None, attributes: Mapping[str, Any] | None = None
@@ -225,7 +228,7 @@ class Ledger(TrialWriter):
             if owner is None or owner.number != trial.number:
                 self._end(trial_id, TrialState.FAIL, outcome="given up: the run has another trial")
                 continue
-            claim = Claim(trial_id, Run(**trial.user_attrs[RUN]))
+            claim = Claim(trial_id, run_of(trial))
             try:
                 for name, value in {**(attributes or {}), WORKER: worker}.items():
                     self.annotate(claim, name, value)

@@ -56,6 +56,17 @@ def is_open_or_ended(trial: FrozenTrial) -> bool:
     return trial.state is not TrialState.FAIL or ERROR in trial.user_attrs
 
 
+def run_of(trial: FrozenTrial) -> Run:
+    """
+    Return the run of a trial.
+
+    :param trial: the trial
+    :return: the run
+    :raises SweepError: if another version of sb3-cgp described it, by other fields
+    """
+    return Run.from_fields(trial.user_attrs[RUN], f"Trial {trial.number} of the study")
+
+
 def owned(trials: Iterable[FrozenTrial]) -> dict[str, FrozenTrial]:
     """
     Return the trial of each run.

@@ -7,8 +7,8 @@ from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial
 
 from benchmark.common.records import Record
-from benchmark.sweeps.runs import Run, overview
-from benchmark.sweeps.study_trials import COMMAND, KEY, RUN, SWEEP, choices_of, owned, record_of
+from benchmark.sweeps.runs import overview
+from benchmark.sweeps.study_trials import COMMAND, KEY, SWEEP, choices_of, owned, record_of, run_of
 
 
 class StudyView:
@@ -55,7 +55,7 @@ class StudyView:
         noted = [(value["runs_ended"], name) for name, value in attributes.items() if name.startswith(COMMAND)]
         commands = [attributes[name] for _, name in sorted(noted)]
         trials = self.trials()
-        runs = [Run(**trial.user_attrs[RUN]) for trial in trials]
+        runs = [run_of(trial) for trial in trials]
         given = overview(runs, choices_of(trials, "method"), choices_of(trials, "task"))
         return {**attributes[SWEEP], **given, "commands": commands}
 

@@ -22,7 +22,7 @@ from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, has_state, run_f
 from benchmark.sweeps.runs import Run
 from benchmark.sweeps.signals import TERMINATED, end_if_asked, undisturbed
 from benchmark.sweeps.studies import Ledger
-from benchmark.sweeps.study_trials import PROCESSORS, RUN, Claim, owned
+from benchmark.sweeps.study_trials import PROCESSORS, Claim, owned, run_of
 from sb3_cgp.resumption.store import StateStore
 
 
@@ -136,7 +136,7 @@ def forget_ended(ledger: Ledger, logs: Path) -> None:
     :param ledger: a study of which no run is left
     :param logs: the folder of all sweeps' runs
     """
-    ended = [Run(**trial.user_attrs[RUN]) for trial in owned(ledger.trials()).values() if trial.state.is_finished()]
+    ended = [run_of(trial) for trial in owned(ledger.trials()).values() if trial.state.is_finished()]
     for path in (logs / ledger.name / FOLDER).glob(f"*/{GROUP_RUNS}"):
         group = Group.read(path.parent)
         if all(run in ended for run in group.runs):
