@@ -1,5 +1,7 @@
 """Observations that their space cannot hold, which NumPy would change, are refused before they are stored."""
 
+import re
+
 import numpy as np
 import pytest
 from faulty_environments import SMALL, Failing, with_observation
@@ -8,6 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMoni
 
 from sb3_cgp import CGP
 from sb3_cgp.common.spaces import by_key
+from sb3_cgp.population import ChunkedSubprocVecEnv
 
 PIXELS = spaces.Box(0, 255, (2, 3), np.uint8)
 PIXELS_BY_KEY = spaces.Dict(image=PIXELS, speed=spaces.Box(-1, 1, (2,)))
@@ -68,6 +71,20 @@ def test_one_from_a_worker_is_refused_too(name):
     with pytest.raises(ValueError, match="without the key 'speed' of its space" if name == "without a key" else message):
         make_model(env).learn(40)
     env.close()
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_one_from_a_process_of_several_environments_is_refused_there(name, capfd):
+    """The process collects observations as a ``DummyVecEnv`` does, so that the main process would see them rounded."""
+    space, observation, message = REFUSED[name]
+    faults = [with_observation(observation), None]
+    env_fns = [lambda fault=fault: Integers(fault, N_GOOD, observation_space=space) for fault in faults]
+    env = ChunkedSubprocVecEnv(env_fns, n_processes=1, start_method="fork")
+    model = make_model(env)
+    with pytest.raises(RuntimeError, match="An exception in it is printed above"):
+        model.learn(80)
+    assert model.replay_buffer.size() == N_GOOD - 1
+    assert re.search(rf"(?s)ValueError: The .*{message}", capfd.readouterr().err)
 
 
 @pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor, VecNormalize], ids=["bare", "VecMonitor", "VecNormalize"])

@@ -11,7 +11,7 @@ from sb3_cgp.common.spaces import by_key
 RETURN_EVERY_KEY = "Return every key of the observation space from `reset` and `step`, or remove it from the space."
 
 
-def check_shape(name: str, values: Any, space: spaces.Space, n_envs: int | None, timestep: int) -> None:
+def check_shape(name: str, values: Any, space: spaces.Space, n_envs: int | None, timestep: int | None) -> None:
     """
     Refuse observations without a key of their space, or of another shape, which NumPy may broadcast to it.
 
@@ -19,7 +19,7 @@ def check_shape(name: str, values: Any, space: spaces.Space, n_envs: int | None,
     :param values: the observations of all environments, or of one
     :param space: the observation space
     :param n_envs: number of environments; None for the observation of one
-    :param timestep: the environment step
+    :param timestep: the environment step; None if it is not known, as in an environment's process
     :raises ValueError: naming the keys, or the shape and the one that is expected
     """
     batch = () if n_envs is None else (n_envs,)
@@ -27,7 +27,7 @@ def check_shape(name: str, values: Any, space: spaces.Space, n_envs: int | None,
         if key is not None and not (isinstance(values, Mapping) and key in values):
             has = list(values) if isinstance(values, Mapping) else f"{type(values).__name__} without keys"
             raise ValueError(
-                f"The environment returned an incomplete {name} at environment step {timestep}: {has}, where its space has "
+                f"The environment returned an incomplete {name}{_at(timestep)}: {has}, where its space has "
                 f"the keys {list(by_key(space))}. It was not stored. {RETURN_EVERY_KEY}"
             )
         part, which = _part(values, name, key)
@@ -37,14 +37,14 @@ def check_shape(name: str, values: Any, space: spaces.Space, n_envs: int | None,
             raise wrong_shape(which, shape, expected, timestep)
 
 
-def check_integers(name: str, values: Any, space: spaces.Space, timestep: int) -> None:
+def check_integers(name: str, values: Any, space: spaces.Space, timestep: int | None) -> None:
     """
     Refuse values that NumPy would round or wrap to the integers of their space, or that its one-hot code has not.
 
     :param name: the name of the values, for the error
     :param values: the observations of all environments, or of one, not normalised
     :param space: the observation space
-    :param timestep: the environment step
+    :param timestep: the environment step; None if it is not known, as in an environment's process
     :raises ValueError: naming the value, and what is expected
     """
     for key, subspace in by_key(space).items():
@@ -58,18 +58,22 @@ def _part(values: Any, name: str, key: str | None) -> tuple[Any, str]:
     return (values, name) if key is None else (values[key], f"{name} `{key}`")
 
 
-def wrong_shape(name: str, shape: tuple[int, ...], expected: tuple[int, ...], timestep: int) -> ValueError:
+def wrong_shape(name: str, shape: tuple[int, ...], expected: tuple[int, ...], timestep: int | None) -> ValueError:
     """
     Return the error for values of a wrong shape.
 
     :param name: the name of the values
     :param shape: their shape
     :param expected: the shape that is expected
-    :param timestep: the environment step
+    :param timestep: the environment step; None if it is not known, as in an environment's process
     :return: the error
     """
-    message = f"The environment returned an array of a wrong shape at environment step {timestep}"
+    message = f"The environment returned an array of a wrong shape{_at(timestep)}"
     return ValueError(f"{message}: the {name} has shape {shape}, where {expected} is expected. It was not stored.")
+
+
+def _at(timestep: int | None) -> str:
+    return "" if timestep is None else f" at environment step {timestep}"
 
 
 def _without_leading_ones(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -77,7 +81,7 @@ def _without_leading_ones(shape: tuple[int, ...]) -> tuple[int, ...]:
     return shape[n_ones:]
 
 
-def _check_range(name: str, values: np.ndarray, space: spaces.Space, timestep: int) -> None:
+def _check_range(name: str, values: np.ndarray, space: spaces.Space, timestep: int | None) -> None:
     if values.dtype.kind not in "buif" or (isinstance(space, spaces.Box) and np.can_cast(values.dtype, space.dtype)):
         return
     low, high = _range(space)
@@ -91,7 +95,7 @@ def _check_range(name: str, values: np.ndarray, space: spaces.Space, timestep: i
         index = tuple(np.argwhere(~fits)[0].tolist())
         highest = np.broadcast_to(high, values.shape)[index]
         raise ValueError(
-            f"The {name} that the environment returned at environment step {timestep} has the value {values[index]} at index "
+            f"The {name} that the environment returned{_at(timestep)} has the value {values[index]} at index "
             f"{index}, where its space, {space}, has integers from {low} to {highest}. It was "
             "not stored. Correct the environment's `observation_space`; a wrapper that changes observations, such as one that "
             "scales images to [0, 1], has to set its own."

@@ -2,9 +2,25 @@
 
 import signal
 from multiprocessing.connection import Connection
+from typing import Any
 
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
+
+from sb3_cgp.guards.observation_fit import check_integers, check_shape
+
+
+class _CheckedEnvs(DummyVecEnv):
+    """
+    Environments whose observations are checked before they are collected.
+
+    NumPy rounds or broadcasts those that do not fit, so that the main process could not tell them any more.
+    """
+
+    def _save_obs(self, env_idx: int, obs: Any) -> None:
+        check_shape("observation", obs, self.observation_space, None, timestep=None)
+        check_integers("observation", obs, self.observation_space, timestep=None)
+        super()._save_obs(env_idx, obs)
 
 
 def step_chunk(remote: Connection, parent_remote: Connection, env_fns: CloudpickleWrapper) -> None:
@@ -20,7 +36,7 @@ def step_chunk(remote: Connection, parent_remote: Connection, env_fns: Cloudpick
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     parent_remote.close()
-    envs = DummyVecEnv(env_fns.var)
+    envs = _CheckedEnvs(env_fns.var)
     while True:
         try:
             command, data = remote.recv()
