@@ -1,6 +1,7 @@
 """Folders of states that belong to one training at a time, states on other kinds of buffers, and copies of models."""
 
 import copy
+import errno
 import gc
 import os
 import pickle
@@ -97,6 +98,13 @@ def test_on_a_file_system_without_locks_nothing_is_left_that_blocks(is_copied, t
         with pytest.warns(UserWarning, match=r"cannot be locked \(.*\): make sure that no other process uses it"):
             lock.acquire()
         assert not lock._lock.is_locked
+
+
+def test_a_folder_that_cannot_be_locked_for_another_reason_is_an_error(tmp_path, fail_to_lock):
+    """With too many files open, two trainings would write to it."""
+    fail_to_lock(errno.EMFILE)
+    with pytest.raises(OSError, match="Too many open files"):
+        make_model().learn(30, TrainingCheckpointCallback(10, tmp_path / "state"))
 
 
 def test_an_error_lets_go_of_the_folder(folder):

@@ -1,5 +1,6 @@
 """Locks on folders of training states and of runs: a folder belongs to one training at a time."""
 
+import errno
 import gc
 import os
 import socket
@@ -12,6 +13,8 @@ from filelock import FileLock, Timeout
 LOCK_FILE = ".lock"
 # Of a file of its own, as some versions of filelock truncate the file that they lock
 OWNER_SUFFIX = "-owner"
+# Errors of a file system without locks
+NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 
 
 class FolderInUseError(RuntimeError):
@@ -48,37 +51,50 @@ class FolderLock:
         A folder that cannot be written to needs no lock. On a file system without locks, a warning is given.
 
         :raises FolderInUseError: if another training holds it, naming its host and process
+        :raises OSError: if it cannot be locked for another reason, such as too many open files
         """
         try:
-            self._acquire()
+            self._acquire(timeout=0)
         except Timeout:
             # A deleted model holds its lock until the garbage collector runs, as SB3's models are part of reference cycles
             gc.collect()
             try:
-                self._acquire()
+                self._acquire(timeout=0)
             except Timeout:
                 raise FolderInUseError(
-                    f"The folder {self.folder} is in use by another training: {self._read_owner()}. A folder belongs "
+                    f"The folder {self.folder} is in use by another training: {self.read_owner()}. A folder belongs "
                     "to one training at a time. Wait for that training to end, stop it, or, if it is a model "
                     "in this process, delete that model."
                 ) from None
 
-    def _acquire(self) -> None:
+    def wait(self) -> None:
+        """
+        Acquire the lock, after waiting for as long as another training holds it.
+
+        :raises OSError: as :meth:`acquire` does
+        """
+        self._acquire(timeout=-1)
+
+    def _acquire(self, timeout: float) -> None:
         try:
-            self._lock.acquire(timeout=0)
+            self._lock.acquire(timeout)
         except Timeout:
             raise
         except OSError as error:
-            if self.folder.is_dir() and os.access(self.folder, os.W_OK):
-                warnings.warn(
-                    f"The folder {self.folder} cannot be locked ({error}): make sure that no other process uses it.",
-                    stacklevel=2,
-                )
+            if not os.access(self.folder, os.W_OK):
+                return
+            if error.errno not in NO_LOCKS:
+                raise
+            warnings.warn(
+                f"The folder {self.folder} cannot be locked ({error}): make sure that no other process uses it.",
+                stacklevel=3,
+            )
             return
         with suppress(OSError):
             self._owner_file.write_text(f"process {os.getpid()} on host {socket.gethostname()}")
 
-    def _read_owner(self) -> str:
+    def read_owner(self) -> str:
+        """Return the process and the host that hold the lock, in words."""
         try:
             return self._owner_file.read_text() or "an unknown process"
         except OSError:
