@@ -9,6 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 import torch as th
+import yaml
 
 from sb3_cgp.resumption.signals import StopSignals
 
@@ -214,6 +215,23 @@ def short_final_evaluation(monkeypatch):
     """Evaluate a finished run in two episodes: this is most of a tiny run's time otherwise."""
     for module in ("run", "population_run"):
         monkeypatch.setattr(f"benchmark.sweeps.{module}.FINAL_EPISODES", 2)
+
+
+@pytest.fixture
+def sweep_of(tmp_path):
+    """Write a sweep's file, mine.yml, and read it."""
+    # Here, as pydantic takes a moment to import
+    from benchmark.sweeps.experiments import load_sweep
+
+    content = dict(title="A sweep", methods=["TD3", "CGP-Online"], tasks=["Pendulum-v1"], steps=100, seeds=2)
+    content["evaluation_interval"] = 10
+
+    def write_and_load(**changes):
+        path = tmp_path / "mine.yml"
+        path.write_text(yaml.safe_dump({key: value for key, value in (content | changes).items() if value is not None}))
+        return load_sweep(str(path))
+
+    return write_and_load
 
 
 @pytest.fixture

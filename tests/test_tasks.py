@@ -341,4 +341,4 @@ def test_sweep_of_the_tasks():
         assert sweep.file.steps == 20 * sweep.file.evaluation_interval
         assert all(run.gym_packages == ["benchmark.tasks"] for run in sweep.runs())
         (width,) = {run.hyperparams["policy_kwargs"] for run in sweep.runs()}
-        assert width == f"dict(net_arch={[256, 256] if sweep.name == 'e10-locomotion' else [64, 64]})"
+        assert width == "dict(net_arch=[64, 64])"
