@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import pytest
 import yaml
 from examples import ROOT, STEPS, shortened
-from learning import SWUNG_UP, median_return
+from learning import RANDOM, SWUNG_UP
 from stable_baselines3.common.callbacks import EvalCallback
 
 FOLDER = ROOT / "docs" / "notebooks"
@@ -71,16 +71,16 @@ def printed_return(name, text):
 
 @pytest.mark.slow
 def test_the_quickstart_learns(monkeypatch, tmp_path, capsys):
-    gaps = []
-
-    def learnt_return(seed):
+    returns, kept = [], []
+    for seed in range(3):
         assert run("quickstart.md", monkeypatch, tmp_path, seed)["model"].seed == seed
         text = capsys.readouterr().out
-        gaps.append(abs(printed_return("cem: ", text) - printed_return("actor: ", text)))
-        return printed_return("", text)
-
-    assert SWUNG_UP <= median_return(learnt_return, least=SWUNG_UP) < -100
-    assert statistics.median(gaps) < 20
+        returns.append(printed_return("", text))
+        # What the actor keeps of CEM's gain over random actions
+        kept.append((printed_return("actor: ", text) - RANDOM) / (printed_return("cem: ", text) - RANDOM))
+    assert SWUNG_UP <= statistics.median(returns) < -100
+    # One of five actors keeps less: the notebook says so
+    assert 0.95 < statistics.median(kept) < 1.05
 
 
 @pytest.mark.slow
