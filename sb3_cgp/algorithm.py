@@ -280,7 +280,7 @@ class CGP(
             raise ValueError(
                 "A training state has been loaded by `resume`: call `learn`, which continues it, before `train_policy`."
             )
-        check_callback("callback", callback)
+        check_callback(callback)
         check_gradients(self)
         check_actor_learns(self.actor)
         with self.as_training(), explaining_errors(self):

@@ -25,8 +25,10 @@ def hyperparameters(model: BaseAlgorithm) -> dict[str, str | float]:
     :return: the arguments of the model's constructor by name, the algorithm's name and the number of environments. Numbers
         stay numbers. All else is text; that of a schedule has its values at the start and at the end of the training.
     """
+    # Of an algorithm whose constructor takes further arguments that are none of its bases'
+    declared = getattr(type(model), "hyperparameter_names", None)
     # An argument that the algorithm does not keep as an attribute cannot be read
-    names = _argument_names(type(model)) - _LEFT_OUT
+    names = set(declared or constructor_argument_names(type(model))) - _LEFT_OUT
     values = {name: getattr(model, name) for name in sorted(names) if hasattr(model, name)}
     values |= {"algorithm": type(model), "policy": model.policy_class, "n_envs": model.n_envs}
     # The learning rates in effect: SB3's schedule for every form of the argument, and the actor's own where there is one
@@ -34,20 +36,6 @@ def hyperparameters(model: BaseAlgorithm) -> dict[str, str | float]:
         if name in values and hasattr(model, schedule):
             values[name] = getattr(model, schedule)
     return {name: _shown(value) for name, value in values.items()}
-
-
-def _argument_names(algorithm: type[BaseAlgorithm]) -> set[str]:
-    """
-    Return the names of the arguments that an algorithm's constructor takes, those that it passes on to its bases included.
-
-    :param algorithm: the algorithm's class. Its ``hyperparameter_names``, if it has them, stand for the names: a constructor
-        whose further arguments are no arguments of its bases declares them.
-    :return: the names
-    """
-    declared = getattr(algorithm, "hyperparameter_names", None)
-    if declared is not None:
-        return set(declared)
-    return constructor_argument_names(algorithm)
 
 
 def _shown(value: Any) -> str | float:

@@ -140,6 +140,18 @@ class TestOffline:
         loaded.save(tmp_path / "trained")
         assert CGP.load(tmp_path / "trained").policy.inference == "actor"
 
+    def test_a_loaded_model_logs_in_a_folder_of_its_own(self, tmp_path):
+        logs = str(tmp_path / "logs")
+        model = make_model(tensorboard_log=logs).learn(60)
+        model.save(tmp_path / "model")
+        model.save_replay_buffer(tmp_path / "buffer")
+        # The newest folder is another's
+        make_model(tensorboard_log=logs).learn(60)
+        loaded = CGP.load(tmp_path / "model", env="Pendulum-v1")
+        loaded.load_replay_buffer(tmp_path / "buffer")
+        loaded.train_policy(max_steps=60)
+        assert loaded.logger.dir == f"{logs}/CGP_3"
+
     # A round has ten steps here, and the plateau is after six rounds at the earliest
     @pytest.mark.parametrize(("n_steps", "acts"), [(7, "CEM"), (17, "the actor")])
     def test_a_policy_that_a_callback_stops_before_its_plateau_is_warned_of_and_stays_due(self, n_steps, acts):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 
-from sb3_cgp.resumption.plain_data import NotPlainError, from_plain, plain_attributes, set_plain_attributes, to_plain
+from sb3_cgp.resumption.plain_data import NotPlainError, equal, from_plain, plain_attributes, set_plain_attributes, to_plain
 
 KEYS = st.none() | st.booleans() | st.integers() | st.text() | st.just("__type__") | st.tuples(st.integers(), st.binary())
 NUMBERS = st_numpy.boolean_dtypes() | st_numpy.integer_dtypes() | st_numpy.floating_dtypes() | st_numpy.complex_number_dtypes()
@@ -52,6 +52,19 @@ def test_collections_keep_their_kind(value):
     assert again == value
     for name in ("maxlen", "default_factory"):
         assert getattr(again, name, None) == getattr(value, name, None)
+
+
+@pytest.mark.parametrize("kind", [set, frozenset])
+def test_the_order_of_a_set_does_not_count(kind):
+    """Python gives strings another order in each process."""
+    first, second = ({"__type__": kind.__name__, "items": [*items]} for items in ("abc", "cab"))
+    assert equal(first, second)
+    assert equal({"nested": [first]}, {"nested": [second]})
+    assert not equal(first, {"__type__": kind.__name__, "items": ["a", "b"]})
+    assert not equal(first, {"__type__": "deque", "items": ["a", "b", "c"], "maxlen": None})
+    # That of others does
+    queues = [{"__type__": "deque", "items": [*items], "maxlen": None} for items in ("abc", "cab")]
+    assert not equal(*queues)
 
 
 @pytest.mark.parametrize(

@@ -93,6 +93,24 @@ def test_a_search_near_the_actor_is_accepted_where_the_actor_can_learn(arguments
     assert any(not th.equal(*pair) for pair in zip(before, model.actor.parameters(), strict=True))
 
 
+def test_a_selector_that_names_the_number_of_its_samples_otherwise_is_accepted():
+    class Random:
+        """The best of random actions and of the proposal."""
+
+        takes_proposals, start, count = True, ActorStart(), 8
+
+        def select(self, score, n_states, action_dim, device="cpu", proposals=None):
+            actions = 2 * th.rand(n_states, self.count, action_dim) - 1
+            actions = actions if proposals is None else th.cat([proposals, actions], dim=1)
+            best = actions[th.arange(n_states), score(actions).argmax(dim=1)]
+            return Selection(best, best.unsqueeze(1))
+
+    model = make_model(policy_kwargs=dict(net_arch=[16], selector=Random()))
+    before = [parameter.clone() for parameter in model.actor.parameters()]
+    model.learn(60)
+    assert any(not th.equal(*pair) for pair in zip(before, model.actor.parameters(), strict=True))
+
+
 @pytest.mark.parametrize(
     ("make", "expected"),
     [

@@ -26,8 +26,8 @@ def start_training(model: OffPolicyAlgorithm, callback: MaybeCallback, max_steps
     :raises ImportError: if a progress bar needs a package that is not installed, tqdm or rich
     """
     if not hasattr(model, "_logger"):
-        # No `learn` has configured it, as in a loaded model
-        model._logger = configure_logger(model.verbose, model.tensorboard_log, "CGP", reset_num_timesteps=False)
+        # No `learn` has configured it, as in a loaded model. SB3 would otherwise write to the folder of the newest run.
+        model._logger = configure_logger(model.verbose, model.tensorboard_log, "CGP", reset_num_timesteps=True)
     callback = model._init_callback(callback)
     callback = _with_progress_bar(callback) if progress_bar else callback
     callback.on_training_start(_learn_locals(model, callback, max_steps, progress_bar), globals())

@@ -78,19 +78,18 @@ def require_count(name: str, value: Any, minimum: int = 1) -> None:
     require(is_integer and value >= minimum, name, value, f"an integer >= {minimum}")
 
 
-def as_count(name: str, value: Any, minimum: int = 1, advice: str = "") -> int:
+def as_count(name: str, value: Any, advice: str = "") -> int:
     """
-    Return a count as an integer, also of an equal float such as 1e5, as SB3 takes some.
+    Return a count of at least 0 as an integer, also of an equal float such as 1e5, as SB3 takes some.
 
     :param name: the argument's name
     :param value: the argument's value
-    :param minimum: the smallest value that is allowed
     :param advice: what the error adds to the rule
     :return: the integer
-    :raises ValueError: if the value is no integer of at least ``minimum``, nor a float equal to one
+    :raises ValueError: if the value is no integer of at least 0, nor a float equal to one
     """
     number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
-    require(number >= minimum and number % 1 == 0, name, value, f"an integer >= {minimum}{advice}")
+    require(number >= 0 and number % 1 == 0, name, value, f"an integer >= 0{advice}")
     return int(value)
 
 

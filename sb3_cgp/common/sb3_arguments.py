@@ -131,7 +131,7 @@ def check_off_policy_arguments(model: OffPolicyAlgorithm) -> None:
     for name in ("batch_size", "buffer_size", "n_steps"):
         require_count(name, getattr(model, name))
     # The only one of these counts that SB3 takes as a float
-    model.learning_starts = as_count("learning_starts", model.learning_starts, minimum=0)
+    model.learning_starts = as_count("learning_starts", model.learning_starts)
     require_count("gradient_steps", model.gradient_steps, minimum=-1)
     check_train_freq(model.train_freq, model.n_envs)
     for name in ("tau", "gamma"):

@@ -39,8 +39,8 @@ def check_learn_arguments(model: OffPolicyAlgorithm, total_timesteps: Any, callb
     """
     is_infinite = isinstance(total_timesteps, float) and total_timesteps == math.inf
     advice = ": for a training that a callback ends, give a large one such as 10**12" if is_infinite else ""
-    count = as_count("total_timesteps", total_timesteps, minimum=0, advice=advice)
-    check_callback("callback", callback)
+    count = as_count("total_timesteps", total_timesteps, advice=advice)
+    check_callback(callback)
     # SB3 converts it when the model is made, by this private method, and not again.
     check_train_freq(model.train_freq, model.n_envs)
     model._convert_train_freq()
@@ -101,20 +101,19 @@ def explaining_policy_kwargs() -> Iterator[None]:
         raise ValueError(f"{error} {LEAVE_POLICY_KWARGS_OUT}") from error
 
 
-def check_callback(name: str, value: Any) -> None:
+def check_callback(callback: Any) -> None:
     """
     Check the callback of a training, and the callbacks within SB3's own ones.
 
-    :param name: the argument's name
-    :param value: the callback, a list of them, a function of the local and global variables, or None
+    :param callback: the callback, a list of them, a function of the local and global variables, or None
     :raises ValueError: if one of them is a class, or nothing that can be called back
     """
-    is_function = callable(value) and not isinstance(value, type)
-    if value is None or (is_function and not isinstance(value, BaseCallback)):
+    is_function = callable(callback) and not isinstance(callback, type)
+    if callback is None or (is_function and not isinstance(callback, BaseCallback)):
         return
-    if not isinstance(value, list):
-        _check_instance(name, value, f"{CALLBACK}, a list of them, a function, or None")
-    _check_parts(name, value)
+    if not isinstance(callback, list):
+        _check_instance("callback", callback, f"{CALLBACK}, a list of them, a function, or None")
+    _check_parts("callback", callback)
 
 
 def _check_parts(name: str, value: Any) -> None:

@@ -34,7 +34,7 @@ def observing_environments(model: OffPolicyAlgorithm) -> Iterator[None]:
         yield
         return
     # A private method, as nothing outside of the environment sees an observation before it is collected
-    observer = _ObservationObserver(env, model, is_clipped=_sees_raw(model.get_vec_normalize_env()))
+    observer = _ObservationObserver(env, model, normalizer_sees_raw=_sees_raw(model.get_vec_normalize_env()))
     with _shadowed(env, "_save_obs", observer.save), _observed(env, observer):
         yield
 
@@ -45,11 +45,11 @@ class _ObservationObserver:
 
     :param env: the environment
     :param model: the model that is learning
-    :param is_clipped: whether ``VecNormalize`` receives the observations as they are, and would clip infinite ones
+    :param normalizer_sees_raw: whether ``VecNormalize`` receives the observations as they are, and would clip infinite ones
     """
 
-    def __init__(self, env: DummyVecEnv, model: OffPolicyAlgorithm, is_clipped: bool):
-        self._env, self._is_clipped = env, is_clipped
+    def __init__(self, env: DummyVecEnv, model: OffPolicyAlgorithm, normalizer_sees_raw: bool):
+        self._env, self._normalizer_sees_raw = env, normalizer_sees_raw
         self._model: weakref.ref[OffPolicyAlgorithm] | None = weakref.ref(model)
         # The final observations that have been seen. Of those of before, copies: the environment may use its array again.
         self._seen = [copy.deepcopy(info.get("terminal_observation")) for info in env.buf_infos]
@@ -94,7 +94,7 @@ class _ObservationObserver:
         # One that is refused is not found by another training on this environment
         del info["terminal_observation"]
         space, timestep = self._env.observation_space, model.num_timesteps + self._env.num_envs
-        if self._is_clipped:
+        if self._normalizer_sees_raw:
             check_final_observation(final, space, timestep)
         else:
             check_shape("terminal observation", final, space, None, timestep)

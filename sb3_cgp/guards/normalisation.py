@@ -70,7 +70,7 @@ class NormalisationGuard(OffPolicyAlgorithm):
             )
 
     def _warn_of_new_statistics(self) -> None:
-        """Warn if the statistics of the observations know those of this training alone, and those of the model do not."""
+        """Warn if ``VecNormalize`` has counted this training's observations alone, unlike that with which the model learnt."""
         normalizer = self._vec_normalize_env
         if not self._learnt_normalized or not normalises(normalizer):
             return

@@ -65,10 +65,10 @@ def callback_states(
     callback: BaseCallback, training_env: VecEnv, initial: Mapping[int, Start]
 ) -> tuple[list[State], list[str]]:
     """
-    Return the states of all callbacks, with whether each has counted something since the training started, and the obstacles.
+    Return the states of all callbacks, with whether each has changed since the training started, and the obstacles.
 
-    A callback has counted if an attribute differs from that time: one of the constructor's arguments, too, or one that is not
-    plain data (:func:`~sb3_cgp.resumption.fingerprints.fingerprint`). One that declares its state has counted if this has
+    A callback has changed if an attribute differs from that time: one of the constructor's arguments, too, or one that is not
+    plain data (:func:`~sb3_cgp.resumption.fingerprints.fingerprint`). One that declares its state has changed if this has
     more than the counters of every callback. Attributes that have not changed are not saved, as the constructor of the
     resumed training's callback may have set them by other arguments.
 
@@ -78,7 +78,7 @@ def callback_states(
     :return: plain data, for each callback in the order of :func:`iter_callbacks`; and a sentence for each part that is lost
     """
     problems: list[str] = []
-    # One that the training was given after its start has counted
+    # One that the training was given after its start has changed
     unknown, callbacks = Start({}, was_called=True), iter_callbacks(callback)
     return [_callback_state(each, training_env, initial.get(id(each), unknown), problems) for each in callbacks], problems
 
@@ -103,7 +103,7 @@ def restore_callbacks(callback: BaseCallback, states: list[State]) -> None:
         found = present.get((name, saved[name]))
         saved[name] += 1
         if found is None:
-            if state["environments"] or state["has_counted"]:
+            if state["environments"] or state["has_changed"]:
                 warnings.warn(f"A {name} was among the callbacks, and is not now: what it counted is lost.", stacklevel=2)
             continue
         _restore_callback(found, state)
@@ -134,12 +134,12 @@ def _callback_state(callback: BaseCallback, training_env: VecEnv, start: Start, 
             problems.append(f"The state of {type(callback).__name__}'s `{name}` cannot be saved: {' '.join(obstacles)}")
     if hasattr(callback, "get_training_state"):
         own = callback.get_training_state()
-        counted = own.keys() - COMMON if isinstance(own, dict) else own is not None
+        beyond = own.keys() - COMMON if isinstance(own, dict) else own is not None
         plain = declared_state(f"{state['class']}.get_training_state()", own)
-        return state | {"own": plain, "has_counted": bool(counted)}
+        return state | {"own": plain, "has_changed": bool(beyond)}
     now = _fingerprints(callback)
     unchanged = {name for name, value in now.items() if value is not None and value == start.attributes.get(name)}
-    # One that has counted in an earlier training has further values from there
+    # One that has been called in an earlier training has further values from there
     unsaved = _unsaved(callback) | (set() if start.was_called else unchanged)
     state["attributes"] = plain_attributes(callback, without=unsaved)
     # What one that the training was given after its start has changed is not known
@@ -152,7 +152,7 @@ def _callback_state(callback: BaseCallback, training_env: VecEnv, start: Start, 
                 f"{type(callback).__name__}'s `{name}`, which has changed in the training, is not saved, as it is {reason}. A "
                 f"resumed training begins with it as the callback is given. To save it, define {METHODS}."
             )
-    return state | {"has_counted": now != start.attributes}
+    return state | {"has_changed": now != start.attributes}
 
 
 def _fingerprints(callback: BaseCallback) -> Fingerprints:

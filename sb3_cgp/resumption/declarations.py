@@ -17,7 +17,7 @@ class Obstacle(NamedTuple):
     Why the state of an environment cannot be saved.
 
     :param text: a sentence, with what would help
-    :param prevents_restoring: whether the environment cannot be restored, either
+    :param prevents_restoring: False if an earlier state can be restored all the same
     """
 
     text: str

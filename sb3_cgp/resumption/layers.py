@@ -69,7 +69,7 @@ STATELESS_ATTRIBUTES = {
 }
 # SB3's infos of the last step may hold values of any type; they are overwritten before they are read
 INFOS = {"buf_infos", "reset_infos"}
-# Of a checker whose last infos are no plain data: its checks of the first two steps, which only warn, are skipped
+# For a `PassiveEnvChecker` whose last infos are no plain data: its checks of the first steps, which only warn, count as done
 CHECKED = {"_previous_data": None, "checked_step": True, "checked_data_reuse": True}
 RANDOM_STATE = {"_np_random", "_np_random_seed"}
 # They do not change their MuJoCo models; environments of others may

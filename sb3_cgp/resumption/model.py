@@ -25,7 +25,7 @@ class RunningTraining:
     :param initial_callbacks: their attributes at the training's start, by `id`
     :param added_checkpoint: the callback that saves states in a resumed training without one among its callbacks
     :param folder_locks: the locks that the training holds
-    :param n_nested: a policy's offline training may run within `learn`
+    :param n_nested: number of trainings in progress: 2 in a policy's offline training within `learn`
     :param warned_of: the warnings about the training state that were given
     :param checked_optimizers: the optimizers that a resumed training has, too, by name
     """

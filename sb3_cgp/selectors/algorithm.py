@@ -50,18 +50,18 @@ class SelectorAlgorithm(ChangeableAlgorithm):
             self.policy.selector = self._make_selector() if saved is None else saved
         elif self.cem_start == "actor":
             allowed = "'prior' with a selector of `policy_kwargs` or of the policy's class, which replaces CEM"
-            require(self._selector_is_made_here, "cem_start", self.cem_start, allowed)
+            require(self._selector_follows_arguments, "cem_start", self.cem_start, allowed)
         self._check_selector()
         self._warn_if_replaced(*(name for name, default in CEM_ARGUMENTS.items() if getattr(self, name) != default))
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        # One may have been set on the policy
+        # The user may have set another selector on the policy
         self._check_selector()
         return super()._setup_learn(*args, **kwargs)
 
     @property
-    def _selector_is_made_here(self) -> bool:
-        """Whether the selector is that of the arguments, and not one that replaces it."""
+    def _selector_follows_arguments(self) -> bool:
+        """Whether the selector equals the one that the arguments of CEM make, and not one that replaces it."""
         selector, made = self.policy.selector, self._make_selector()
         return type(selector) is type(made) and selector == made
 
@@ -77,17 +77,17 @@ class SelectorAlgorithm(ChangeableAlgorithm):
             # The constructor makes it again, and it may refer to the policy
             vars(self).pop("_saved_selector", None)
         else:
-            self._saved_selector = None if self._selector_is_made_here else selector
+            self._saved_selector = None if self._selector_follows_arguments else selector
         super().save(*args, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_initial_selector"]
 
     def _change_argument(self, name: str, value: Any) -> None:
-        selector, is_made_here = self.policy.selector, self._selector_is_made_here
+        selector, follows_arguments = self.policy.selector, self._selector_follows_arguments
         super()._change_argument(name, value)
         try:
-            if is_made_here:
+            if follows_arguments:
                 self.policy.selector = self._make_selector()
             self._check_selector()
         except ValueError:
@@ -124,12 +124,13 @@ class SelectorAlgorithm(ChangeableAlgorithm):
     def _check_imitation(self) -> None:
         """Check that an actor which imitates the selector is shown other actions than its own."""
         selector = self.policy.selector
-        start, samples = getattr(selector, "start", None), getattr(selector, "samples", 0)
-        if self.policy_loss != "cgp" or not isinstance(start, ActorStart):
+        start, samples = getattr(selector, "start", None), getattr(selector, "samples", None)
+        # A selector of the user's may call their number otherwise
+        if self.policy_loss != "cgp" or not isinstance(start, ActorStart) or samples is None:
             return
         is_useful = start.leaves_others(samples)
         reason = "policy_loss='cgp', as an actor that imitates itself learns nothing"
-        if self._selector_is_made_here:
+        if self._selector_follows_arguments:
             require(samples > 1, "cem_samples", samples, f"at least 2 with cem_start='actor' and {reason}")
             allowed = f"greater than 0, or `cem_actor_fraction` smaller, with cem_start='actor' and {reason}"
             require(is_useful, "cem_actor_std", start.std, allowed)
@@ -137,7 +138,7 @@ class SelectorAlgorithm(ChangeableAlgorithm):
 
     def _warn_if_replaced(self, *names: str) -> None:
         """Warn that arguments of CEM have no effect where another selector replaces CEM."""
-        if names and not self._selector_is_made_here:
+        if names and not self._selector_follows_arguments:
             arguments = ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
             warnings.warn(
                 f"{arguments} has no effect, as the selector {self.policy.selector} replaces CEM: set the selector's own "
