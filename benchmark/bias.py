@@ -16,7 +16,7 @@ from gymnasium import spaces
 from benchmark.common.arguments import continuous_environment, count
 from benchmark.common.measuring import measuring_parser
 from benchmark.values.bias_page import draw, markdown
-from benchmark.values.bias_runs import check_settings, read_records, train_missing
+from benchmark.values.bias_runs import check_folder, read_records, train_missing
 from benchmark.values.episodes import horizon
 from benchmark.values.methods import METHODS
 from sb3_cgp.common.files import write_atomically
@@ -87,7 +87,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     if min(args.seeds) < 0:
         parser.error(f"argument --seeds: {min(args.seeds)} must be at least 0")
     try:
-        check_settings(args)
+        check_folder(args)
     except ValueError as error:
         parser.error(f"argument --folder: {error}")
     return args

@@ -13,7 +13,7 @@ import torch as th
 
 from benchmark.common.arguments import continuous_environment, count
 from benchmark.common.measuring import measuring_parser
-from benchmark.speed.precision_runs import read_records, train_missing
+from benchmark.speed.precision_runs import check_folder, read_records, train_missing
 from benchmark.speed.precision_tables import markdown
 from sb3_cgp.common.files import write_atomically
 
@@ -41,7 +41,12 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4], help="seeds of the training (default: 0 to 4)"
     )
-    return parser.parse_args(argv)
+    args = parser.parse_args(argv)
+    try:
+        check_folder(args)
+    except ValueError as error:
+        parser.error(f"argument --folder: {error}")
+    return args
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -52,11 +57,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     argv = sys.argv[1:] if argv is None else argv
     args = parse(argv)
-    try:
-        # Before runs of hours
-        read_records(args.folder)
-    except ValueError as error:
-        sys.exit(f"Error: {error}")
     th.set_num_threads(args.threads)
     train_missing(args, argv)
     text = markdown(read_records(args.folder))

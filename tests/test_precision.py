@@ -70,7 +70,7 @@ def test_runs_are_recorded_as_they_end_and_not_repeated(tmp_path, monkeypatch):
         return COMMON | {"dtype": dtype, "seed": seed, "returns": [1.0]}
 
     monkeypatch.setattr(precision_runs, "run", run)
-    options = ["--folder", str(tmp_path), "--envs", "Pendulum-v1", "--seeds", "5", "6"]
+    options = ["--folder", str(tmp_path), "--envs", "Pendulum-v1", "--steps", "10", "--seeds", "5", "6"]
     with pytest.raises(KeyboardInterrupt):
         precision.main(options)
     assert len(list(tmp_path.glob("*.json"))) == 2
@@ -85,12 +85,33 @@ def test_a_file_that_a_killed_process_left_is_no_record(tmp_path, read):
     assert read(tmp_path) == []
 
 
-def test_a_damaged_record_is_named_before_any_run(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "seed0.json, line 1, is no JSON: Expecting value. Move it away"),
+        ('{"env": "Pendulum-v1"}', "seed0.json lacks dtype, seed, steps. Move it away"),
+        ({"steps": 10}, "holds runs with steps=10: choose another --folder for steps=20000"),
+    ],
+)
+def test_records_that_are_damaged_or_of_another_length_are_refused_before_any_run(
+    content, message, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(precision_runs, "run", lambda *args: pytest.fail("it trains"))
-    path = tmp_path / "Pendulum-v1_float32_seed0.json"
-    path.touch()
-    with pytest.raises(SystemExit, match=rf"^Error: {path}, line 1, is no JSON: .*Move it away"):
+    if not isinstance(content, str):
+        content = json.dumps(COMMON | {"dtype": "float32", "seed": 7, "returns": [1.0]} | content)
+    (tmp_path / "Pendulum-v1_float32_seed0.json").write_text(content)
+    with pytest.raises(SystemExit):
         precision.main(["--folder", str(tmp_path)])
+    error = capsys.readouterr().err
+    assert f"argument --folder: {tmp_path}" in error
+    assert message in error
+
+
+@pytest.mark.parametrize("options", [["--steps", "10"], ["--envs", "Reacher-v5"]])
+def test_records_of_the_same_length_and_of_other_environments_stay(options, tmp_path):
+    record = COMMON | {"dtype": "float32", "seed": 7, "returns": [1.0]}
+    (tmp_path / "Pendulum-v1_float32_seed7.json").write_text(json.dumps(record))
+    assert precision.parse(["--folder", str(tmp_path), *options]).folder == tmp_path
 
 
 def test_a_run_trains_with_its_data_type_and_compares_elites(tmp_path, monkeypatch):

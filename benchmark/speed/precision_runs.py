@@ -8,9 +8,10 @@ from typing import Any
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from benchmark.common.files import RETRAIN, file_name, read_json, write_json
+from benchmark.common.files import file_name, write_json
 from benchmark.common.provenance import conditions
 from benchmark.common.records import EVALUATION_SEED
+from benchmark.common.seeded_runs import check_settings, read_runs
 from benchmark.common.zoo import read_entry, shortened_warm_up
 from benchmark.speed.elites import critic_overlaps
 from benchmark.speed.training import train_by_zoo
@@ -73,8 +74,21 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
     :return: the records, by task, data type and seed
     :raises ValueError: if one is damaged; it names the file and the remedy
     """
-    records = [read_json(path, ("env", "dtype", "seed"), RETRAIN) for path in folder.glob("[!.]*_seed*.json")]
-    return sorted(records, key=lambda record: (record["env"], record["dtype"], record["seed"]))
+    records = read_runs(folder, ("env", "dtype", "seed", "steps"))
+    return sorted(records.values(), key=lambda record: (record["env"], record["dtype"], record["seed"]))
+
+
+def check_folder(args: argparse.Namespace) -> None:
+    """
+    Check that the finished runs of a folder are as long as those of the command line, of the environments that it has.
+
+    :param args: the command line
+    :raises ValueError: if one has another length, or is damaged
+    """
+    asked = {env_id: args.steps or int(read_entry("cgp", env_id)["n_timesteps"]) for env_id in args.envs}
+    for record in read_records(args.folder):
+        if record["env"] in asked:
+            check_settings(args.folder, {"steps": record["steps"]}, {"steps": asked[record["env"]]})
 
 
 def train_missing(args: argparse.Namespace, argv: Sequence[str]) -> None:

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmark.common.files import RETRAIN, file_name, read_json, write_json
+from benchmark.common.files import RETRAIN, file_name, write_json
 from benchmark.common.provenance import conditions
+from benchmark.common.seeded_runs import check_settings, read_runs
 from benchmark.values.bias import BiasCallback
 from benchmark.values.methods import METHODS, make_model
 
@@ -59,31 +60,24 @@ def read_records(folder: Path) -> list[dict[str, Any]]:
     :return: the records, by method, in the order of ``METHODS``, and seed
     :raises ValueError: if one is damaged, or of an unknown method; it names the file and the remedy
     """
-    records = []
-    for path in folder.glob("[!.]*_seed*.json"):
-        record = read_json(path, ("method", "seed", "settings", "points"), RETRAIN)
+    records = read_runs(folder, ("method", "seed", "settings", "points"))
+    for path, record in records.items():
         if record["method"] not in METHODS:
             raise ValueError(
                 f"{path} has the method {record['method']!r}, which must be one of {', '.join(METHODS)}. {RETRAIN}"
             )
-        records.append(record)
-    return sorted(records, key=lambda record: (list(METHODS).index(record["method"]), record["seed"]))
+    return sorted(records.values(), key=lambda record: (list(METHODS).index(record["method"]), record["seed"]))
 
 
-def check_settings(args: argparse.Namespace) -> None:
+def check_folder(args: argparse.Namespace) -> None:
     """
     Check that the finished runs of a folder have the settings of the command line.
 
     :param args: the command line
     :raises ValueError: if one has other settings, or is damaged
     """
-    asked = settings(args)
     for record in read_records(args.folder):
-        other = {name: value for name, value in record["settings"].items() if value != asked.get(name)}
-        if other:
-            asked_in_words = ", ".join(f"{name}={asked.get(name)!r}" for name in other)
-            found_in_words = ", ".join(f"{name}={value!r}" for name, value in other.items())
-            raise ValueError(f"{args.folder} holds runs with {found_in_words}: choose another --folder for {asked_in_words}")
+        check_settings(args.folder, record["settings"], settings(args))
 
 
 def train_missing(args: argparse.Namespace, argv: Sequence[str]) -> None:
