@@ -11,7 +11,7 @@ from optuna.trial import FrozenTrial, TrialState
 from rich.progress import BarColumn, Progress, TextColumn
 
 from benchmark.sweeps.heartbeats import PROGRESS
-from benchmark.sweeps.study_trials import ERROR, owned
+from benchmark.sweeps.study_trials import CONTINUED, ERROR, KEY, owned
 
 # Seconds over which the speed is measured, over which it is measured for the time left, and between two lines without a
 # terminal. The second is long as a step's cost differs from run to run, and offline policy training takes no step.
@@ -88,6 +88,8 @@ class ProgressTracker:
     def __init__(self, steps: int):
         self._steps = steps
         self._rate, self._long_rate = RateEstimator(WINDOW), RateEstimator(LONG_WINDOW)
+        # By trial, the step from which its steps count for the speed
+        self._starts: dict[int, int] = {}
 
     def add(self, trials: Sequence[FrozenTrial], now: float | None = None) -> SweepProgress:
         """
@@ -101,9 +103,10 @@ class ProgressTracker:
         runs = list(owned(trials).values())
         running = [trial for trial in runs if trial.state is TrialState.RUNNING]
         ended = [trial for trial in runs if trial.state.is_finished()]
-        taken = self._steps * len(ended) + sum(trial.user_attrs.get(PROGRESS, {}).get("step", 0) for trial in running)
+        taken = self._steps * len(ended) + sum(map(_step, running))
         total = self._steps * len(runs)
-        long_speed = self._long_rate.add(now, taken)
+        trained = self._trained(trials)
+        long_speed = self._long_rate.add(now, trained)
         failed = sum(ERROR in trial.user_attrs for trial in ended)
         return SweepProgress(
             runs=len(runs),
@@ -111,9 +114,29 @@ class ProgressTracker:
             running=len(running),
             failed=failed,
             share=taken / max(total, 1),
-            speed=self._rate.add(now, taken),
+            speed=self._rate.add(now, trained),
             seconds_left=None if long_speed is None else (total - taken) / long_speed,
         )
+
+    def _trained(self, trials: Sequence[FrozenTrial]) -> int:
+        """Return the steps that were taken since the first call, without those of the states from which trials went on."""
+        begun: set[str] = set()
+        trained = 0
+        for trial in sorted(trials, key=lambda trial: trial.number):
+            key, step = trial.user_attrs[KEY], _step(trial)
+            goes_on = key in begun or CONTINUED in trial.user_attrs
+            # A trial that goes on reports no step until it has loaded the state
+            if trial.number not in self._starts or (goes_on and self._starts[trial.number] == 0):
+                self._starts[trial.number] = step
+            trained += step - self._starts[trial.number]
+            if step > 0:
+                begun.add(key)
+        return trained
+
+
+def _step(trial: FrozenTrial) -> int:
+    """Return the environment steps that a trial's last heartbeat reported."""
+    return int(trial.user_attrs.get(PROGRESS, {}).get("step", 0))
 
 
 @contextmanager
