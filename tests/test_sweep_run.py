@@ -166,6 +166,19 @@ def test_callbacks_of_ones_own_are_kept(tmp_path, run_of):
     assert len(list((tmp_path / "own").glob("*.zip"))) == 2
 
 
+@pytest.mark.parametrize("name", ["sb3_cgp.TrainingCheckpointCallback", "sb3_cgp.resumption.TrainingCheckpointCallback"])
+@pytest.mark.parametrize("kind", ["list", "mapping", "name"])
+def test_states_are_saved_by_one_callback(tmp_path, run_of, name, kind):
+    """Also where the entry has one, as a tuning's has."""
+    own = {"list": [{name: {"save_freq": 20}}], "mapping": {name: {"save_freq": 20}}, "name": name}[kind]
+    with pytest.raises(Interruption):
+        train(run_of(**TINY, callback=own), tmp_path / "run", lambda step, value: None, interrupt_at(100), "cpu")
+    (entry,) = yaml.safe_load((tmp_path / "run" / "hyperparams.yml").read_text()).values()
+    saving = {"sb3_cgp.resumption.callbacks.TrainingCheckpointCallback": {"save_freq": 30, "keep": 1}}
+    assert entry["callback"] == [saving]
+    assert len(list((tmp_path / "run" / "state").glob("state-*.json"))) == 1
+
+
 def test_a_run_is_not_taken_up_from_the_states_of_another(tmp_path, run_of):
     """... which a study of the same name has left, in a storage that is gone."""
     with pytest.raises(Interruption):

@@ -13,6 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from benchmark.sweeps.runs import Run
 from sb3_cgp.common.files import write_atomically
 from sb3_cgp.resumption.store import NoStateLeftError
+from sb3_cgp.zoo.checkpoints import without_checkpoints
 
 # The file of the hyperparameters, in the folder of the environment's name
 ZOO_CONFIG = "*/config.yml"
@@ -78,13 +79,12 @@ def new_experiment(kind: Callable[..., Experiment], run: Run, folder: Path, devi
 
 
 def _hyperparams(run: Run) -> dict[str, Any]:
-    """Return the hyperparameters with the callback that saves training states, if the algorithm has them."""
+    """Return the hyperparameters with one callback that saves training states, this one, if the algorithm has them."""
     hyperparams: dict[str, Any] = {"n_timesteps": run.steps, **run.hyperparams}
     if issubclass(ALGOS[run.algo], OffPolicyAlgorithm):
         saving = {"sb3_cgp.resumption.callbacks.TrainingCheckpointCallback": {"save_freq": run.checkpoint_interval, "keep": 1}}
-        # rl_zoo3 takes one callback, or a list of them
-        own = run.hyperparams.get("callback") or []
-        hyperparams["callback"] = [*(own if isinstance(own, list) else [own]), saving]
+        # A tuning's entry, such as CGP's, may save states, too
+        hyperparams["callback"] = [*without_checkpoints(run.hyperparams.get("callback")), saving]
     return hyperparams
 
 
