@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from benchmark.common.zoo import read_entry
-from benchmark.sweeps.experiments import included_sweeps, load_sweep, sweeps_folder
+from benchmark.sweeps.experiments import experiments_in_words, included_sweeps, load_sweep, sweeps_folder
 from benchmark.sweeps.processes import share_of_cores, start_workers
 from benchmark.sweeps.runs import overview
 from benchmark.sweeps.validation import SweepError, read_yaml
@@ -168,6 +168,27 @@ def test_a_number_of_random_steps_that_is_meant_for_the_length_of_the_runs_is_ke
     ):
         sweep = sweep_of(methods={"CGP": {"algo": "cgp", "tuned": True}}, steps=steps)
         assert {run.hyperparams.get("learning_starts") for run in sweep.runs()} == {expected}
+
+
+def test_a_wrong_file_is_left_out_of_the_list(tmp_path, monkeypatch):
+    files = {
+        "a": "{title: A, steps: 3000}",
+        "b": "{title: B, includes: [a, e1]}",
+        "broken": "{",
+        "no-title": "{steps: 10}",
+        "no-steps": "{title: C}",
+        "text": "{title: C, steps: many}",
+        "one": "{title: C, includes: 7}",
+        "list": "[1]",
+    }
+    for name, content in files.items():
+        (tmp_path / f"{name}.yml").write_text(content)
+    monkeypatch.setattr("benchmark.common.sweep_names.sweeps_folder", lambda: tmp_path)
+    assert [line.split() for line in experiments_in_words().splitlines()] == [
+        ["sweeps:"],
+        ["a", "A,", "3,000", "steps"],
+        ["b", "B", "=", "a,", "e1"],
+    ]
 
 
 def test_methods_of_ones_own(sweep_of):

@@ -10,6 +10,7 @@ import math
 import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -202,15 +203,18 @@ def experiments_in_words() -> str:
     """
     Return a list of the sweeps that have names.
 
-    :return: name and title of each, a line each
+    :return: name and title of each, a line each, without those whose files are wrong
     """
-
-    lines = []
+    lines = ["sweeps:"]
     for path in map(sweep_path, sweep_names()):
-        content = read_yaml(path)
-        parts = f" = {', '.join(content['includes'])}" if "includes" in content else f", {content['steps']:,} steps"
-        lines.append(f"  {path.stem:<14} {content['title']}{parts}")
-    return "\n".join(["sweeps:", *lines])
+        # A wrong file ends only the commands that take it, which say what is wrong
+        with suppress(SweepError):
+            match read_yaml(path):
+                case {"title": title, "includes": list(names)}:
+                    lines.append(f"  {path.stem:<14} {title} = {', '.join(map(str, names))}")
+                case {"title": title, "steps": int(steps)}:
+                    lines.append(f"  {path.stem:<14} {title}, {steps:,} steps")
+    return "\n".join(lines)
 
 
 def included_sweeps(name: str) -> list[str]:
