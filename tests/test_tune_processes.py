@@ -3,6 +3,7 @@
 import time
 from itertools import count
 
+import optuna
 import pytest
 from optuna.storages import InMemoryStorage
 from optuna.trial import TrialState
@@ -12,7 +13,7 @@ from tunings import arguments, samples, tuner_of
 from benchmark import tune
 from benchmark.sweeps import tuner
 from benchmark.sweeps.storages import patient
-from benchmark.sweeps.study_trials import ERROR, LOST
+from benchmark.sweeps.study_trials import ERROR, LOST, TUNING
 from benchmark.sweeps.tuning import ORIGIN, SCORES
 from benchmark.sweeps.validation import SweepError
 
@@ -173,3 +174,13 @@ def test_a_study_is_not_opened_with_other_settings(work, pretend):
     work(storage=storage)
     with pytest.raises(SweepError, match=r"'study': seeds: was 2 and is now 3.*--study"):
         work(storage=storage, seeds=3)
+
+
+def test_a_study_of_another_version_is_refused_in_words(work, pretend):
+    pretend(lambda run: 1.0)
+    storage = InMemoryStorage()
+    work(storage=storage)
+    study = optuna.load_study(study_name="study", storage=storage)
+    study.set_user_attr(TUNING, study.user_attrs[TUNING] | {"sampler": "random"})
+    with pytest.raises(SweepError, match=r"'study': sampler: was 'random' and is now None.*--study"):
+        work(storage=storage)

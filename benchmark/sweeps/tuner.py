@@ -64,8 +64,9 @@ class Tuner:
                 raise SweepError(f"The study {self._study.study_name!r}", "", problem)
             self._study.set_user_attr(TUNING, now)
         elif was != now:
-            key = next(key for key in now if was.get(key) != now[key])
-            problem = f"was {was.get(key)!r} and is now {now[key]!r}. Choose another name by --study"
+            # Another version may have had other settings
+            key = next(key for key in {**was, **now} if was.get(key) != now.get(key))
+            problem = f"was {was.get(key)!r} and is now {now.get(key)!r}. Choose another name by --study"
             raise SweepError(f"The study {self._study.study_name!r}", key, problem)
 
     def trials(self) -> list[FrozenTrial]:
