@@ -184,6 +184,8 @@ def test_the_command_writes_what_it_measures_and_marks_what_it_estimates(tmp_pat
     speed = record["points"][2]["agent_steps_per_second"]["median"]
     assert f"| TD3 | 2 | {speed:,.0f} (" in page
     assert "## Estimate for a GPU, not measured\n\n**None of these figures was measured.**" in page
+    # Of HalfCheetah's dimensions, not Pendulum's
+    assert "They are for HalfCheetah-v5" in page
     picture = imread(tmp_path / "population.png", format="png")
     assert picture[..., :3].std() > 0.01, "the picture is blank"
 
@@ -232,6 +234,13 @@ def test_estimates_and_measurements_of_separate_calls_are_kept(tmp_path, small):
     assert found("--no-estimate") == (3, 2, True, True)
     assert found("--only-estimate") == (3, 2, True, True)
     assert json.loads((tmp_path / "population.json").read_text())["product_rate"] == {"flops_per_second": 1e9, "size": 1}
+
+
+@pytest.mark.parametrize(("options", "is_estimated"), [([], False), (["--estimate"], True), (["--only-estimate"], True)])
+def test_with_a_gpu_estimates_are_made_where_they_are_asked_for(options, is_estimated, tmp_path, monkeypatch):
+    monkeypatch.setattr("benchmark.common.measuring.device", th.device)
+    args = population.parse(["--device", "cuda", "--folder", str(tmp_path), *options])
+    assert args.estimate == is_estimated
 
 
 def test_without_the_packages_of_page_and_figure_the_record_is_written(tmp_path, small, monkeypatch, capsys):

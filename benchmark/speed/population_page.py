@@ -18,8 +18,9 @@ memory without one."""
 ESTIMATE = """\
 ## Estimate for a GPU, not measured
 
-**None of these figures was measured.** The operators of a gradient step, and the operations of its products, are counted from
-the population's code. They are turned into seconds by the rates of the {name} ({source}: {tflops:.0f} TFLOP/s in float32
+**None of these figures was measured.** They are for HalfCheetah-v5, also where another environment was measured. The operators
+of a gradient step, and the operations of its products, are counted from the population's code. They are turned into seconds by
+the rates of the {name} ({source}: {tflops:.0f} TFLOP/s in float32
 without tensor cores, {bandwidth:.2f} TB/s), which are upper bounds of what programs reach, and by the costs of launches that
 follow from recorded times of one agent on that card (`benchmark/results/runtime_gpu`): {graph:.1f} us for an operator within
 a CUDA graph, {host:.0f} us for one that the CPU launches on its own, {rest:.2f} ms of other work on the CPU, which is taken
