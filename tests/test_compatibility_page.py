@@ -58,6 +58,35 @@ def test_a_page_has_returns_successes_and_what_was_noticed(monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ("errors", "trains", "exports"),
+    [
+        ({"predicts": "AssertionError"}, "yes, but: predicts", "–"),
+        ({"exports": "ZeroDivisionError"}, "yes", "no"),
+        # Interrupted
+        ({}, "yes", "–"),
+    ],
+)
+def test_a_page_says_no_of_an_export_that_failed_and_not_of_one_that_was_not_tried(errors, trains, exports, monkeypatch):
+    package = Package("works", ("works",), ("works",), (Environment("Works-v0", "env = 1"),))
+    monkeypatch.setattr("benchmark.compatibility.page.PACKAGES", (package,))
+    found = {name: value for name, value in WRITTEN.items() if name != "export_difference"}
+    found |= {"errors": {"whole": errors}, "resumes": "bit for bit"}
+    record = {
+        "package": "works",
+        "installation": {"pins": "all", "seconds": 1.0},
+        "environments": {"Works-v0": found},
+        "versions": {"works": "1.2"},
+        "other_versions": {},
+        "python": "3.11.7",
+        "commit": "abc",
+        "machine": {"cpu": "A processor", "cores": 2},
+        "load_average": 0.0,
+    }
+    cells = rows_of(page({"works": record}))["works: Works-v0"]
+    assert (cells[1], cells[3]) == (trains, exports)
+
+
+@pytest.mark.parametrize(
     ("arguments", "imports", "section"),
     [
         (dict(imported="works"), "`works`", None),

@@ -113,7 +113,9 @@ def _cells(environment: Environment, found: dict[str, Any]) -> list[str]:
     # Without an error, the check was interrupted
     resumes = found["resumes"] or ("no" if {"stopped", "resumed"} & found["errors"].keys() else UNKNOWN)
     largest = found.get("export_difference")
-    return [trains, resumes, "no" if largest is None else f"yes ({largest:.0e})", _speed(found), _learns(environment, found)]
+    # After an error in `predict`, it was not tried
+    exports = f"yes ({largest:.0e})" if largest is not None else "no" if "exports" in errors else UNKNOWN
+    return [trains, resumes, exports, _speed(found), _learns(environment, found)]
 
 
 def _speed(found: dict[str, Any]) -> str:
