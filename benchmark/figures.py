@@ -57,6 +57,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parser.parse_args(argv)
     # A shell's * names the folder of the figures and the page, too
     named = [study for study in args.studies if Path(study) not in (args.folder / FIGURES, args.folder / PAGE)]
+    if args.storage is not None and not named:
+        parser.error("argument --storage: name the studies to take from it")
     try:
         folders = [find(study, args.storage, args.folder) for study in named] or study_folders(args.folder)
         if not folders:

@@ -97,6 +97,13 @@ def test_named_study_is_taken_from_its_storage(folder: Path, tmp_path: Path, mon
         main(["yours", "--storage", "postgresql://me:secret@host/x", "--folder", str(tmp_path)])
 
 
+@pytest.mark.parametrize("studies", [[], ["{folder}/figures", "{folder}/results.md"]])
+def test_a_storage_without_a_study_is_refused(studies: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main([*(each.format(folder=tmp_path) for each in studies), "--storage", "sqlite:///x.db", "--folder", str(tmp_path)])
+    assert "argument --storage: name the studies to take from it" in capsys.readouterr().err
+
+
 def test_a_storage_that_does_not_answer_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "notes.db").write_text("no database")
     with pytest.raises(SystemExit, match="Error: the storage does not answer: file is not a database"):
