@@ -13,7 +13,7 @@ import gymnasium as gym
 import torch as th
 from gymnasium import spaces
 
-from benchmark.common.arguments import continuous_environment, count
+from benchmark.common.arguments import continuous_environment, count, seed
 from benchmark.common.measuring import measuring_parser
 from benchmark.values.bias_page import draw, markdown
 from benchmark.values.bias_runs import check_folder, read_records, train_missing
@@ -59,7 +59,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
 
     parser.add_argument("--env", type=continuous_environment, default="Hopper-v5", help="environment (default: %(default)s)")
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), help="methods (default: all)")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1], help="seeds of the training (default: 0 and 1)")
+    parser.add_argument("--seeds", nargs="+", type=seed, default=[0, 1], help="seeds of the training (default: 0 and 1)")
     # From zero, values grow by bootstrapping within some 2 / (τ (1 - γ)) gradient steps: 2,000 by these defaults, 40,000 by
     # the algorithms' own, 0.99 and 0.005
     parser.add_argument("--gamma", type=fraction, default=0.95, help="discount factor (default: %(default)s)")
@@ -84,8 +84,6 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
             f"argument --interval: {args.interval} must have a multiple above --learning-starts, {args.learning_starts}, and "
             f"not above --steps, {args.steps}, so that something is measured"
         )
-    if min(args.seeds) < 0:
-        parser.error(f"argument --seeds: {min(args.seeds)} must be at least 0")
     try:
         check_folder(args)
     except ValueError as error:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import torch as th
 
-from benchmark.common.arguments import continuous_environment, count
+from benchmark.common.arguments import continuous_environment, count, seed
 from benchmark.common.measuring import measuring_parser
 from benchmark.speed.precision_runs import check_folder, read_records, train_missing
 from benchmark.speed.precision_tables import markdown
@@ -39,7 +39,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         "--steps", type=count, help="environment steps (default: those of the YAML file, 1e6 for the paper's tasks)"
     )
     parser.add_argument(
-        "--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4], help="seeds of the training (default: 0 to 4)"
+        "--seeds", nargs="+", type=seed, default=[0, 1, 2, 3, 4], help="seeds of the training (default: 0 to 4)"
     )
     args = parser.parse_args(argv)
     try:

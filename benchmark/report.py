@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rl_zoo3 import ALGOS
 
-from benchmark.common.arguments import add_epilog
+from benchmark.common.arguments import add_epilog, count, natural, seed
 from benchmark.common.environments import import_packages, split_env_id
 from benchmark.common.records import EVALUATION_SEED
 from benchmark.reporting.run_reports import report, summary
@@ -29,11 +29,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--algo", default="cgp", choices=list(ALGOS), help="algorithm (default: %(default)s)")
     parser.add_argument("--env", default="Pendulum-v1", help="environment (default: %(default)s)")
     parser.add_argument("--folder", default="logs", help="rl_zoo3's log folder (default: %(default)s)")
-    parser.add_argument("--exp-id", default=0, type=int, help="number of the run (default: 0, the latest)")
+    parser.add_argument("--exp-id", default=0, type=natural, help="number of the run (default: 0, the latest)")
     parser.add_argument("--run", type=Path, help="the run's folder, in place of the four above")
-    parser.add_argument("--episodes", default=20, type=int, help="episodes of the final evaluation (default: %(default)s)")
+    parser.add_argument("--episodes", default=20, type=count, help="episodes of the final evaluation (default: %(default)s)")
     parser.add_argument(
-        "--seed", default=EVALUATION_SEED, type=int, help="seed of the final evaluation (default: %(default)s)"
+        "--seed", default=EVALUATION_SEED, type=seed, help="seed of the final evaluation (default: %(default)s)"
     )
     add_epilog(
         parser,

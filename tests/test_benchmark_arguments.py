@@ -3,7 +3,7 @@
 import pytest
 from measuring_commands import COMMANDS, CPU
 
-from benchmark import selector
+from benchmark import precision, selector
 from benchmark.common import arguments
 
 
@@ -18,6 +18,9 @@ from benchmark.common import arguments
         ("selector", "--dtypes int8", "argument --dtypes: invalid choice: 'int8'"),
         ("selector", "--threads -1", "argument --threads: '-1' is not an integer >= 1"),
         ("selector", "--device abacus", "argument --device: 'abacus' is not available"),
+        ("selector", "--seed -1", "argument --seed: '-1' is not an integer within [0, 2**32)"),
+        ("selector", "--seed 4294967296", "argument --seed: '4294967296' is not an integer within [0, 2**32)"),
+        ("precision", "--seeds 0 -1", "argument --seeds: '-1' is not an integer within [0, 2**32)"),
         ("latency", "--env CartPole-v1", "argument --env: 'CartPole-v1' has no continuous actions"),
         ("latency", "--actions 0", "argument --actions: '0' is not an integer >= 1"),
         ("scaling", "--axes seed", "argument --axes: invalid choice: 'seed'"),
@@ -26,7 +29,7 @@ from benchmark.common import arguments
 )
 def test_bad_arguments_are_named(tmp_path, capsys, name, options, message):
     with pytest.raises(SystemExit):
-        COMMANDS[name].parse([*options.split(), "--folder", str(tmp_path)])
+        (COMMANDS | {"precision": precision})[name].parse([*options.split(), "--folder", str(tmp_path)])
     assert message in capsys.readouterr().err
 
 

@@ -84,7 +84,7 @@ def test_command_refuses_episodes_too_short_for_a_return(tmp_path, capsys):
             "--interval: 100 must have a multiple above --learning-starts, 120",
         ),
         ("--steps 100 --interval 10 --learning-starts 100", "not above --steps, 100, so that something is measured"),
-        ("--seeds 0 -1", "argument --seeds: -1 must be at least 0"),
+        ("--seeds 0 -1", "argument --seeds: '-1' is not an integer within [0, 2**32)"),
     ],
 )
 def test_command_refuses_what_measures_nothing_or_cannot_train(options, message, tmp_path, capsys):

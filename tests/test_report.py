@@ -196,6 +196,20 @@ def test_damaged_settings_are_named(tmp_path: Path, content: str, reason: str) -
         report.main(["--run", str(tmp_path)])
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--episodes 0", "argument --episodes: '0' is not an integer >= 1"),
+        ("--exp-id -1", "argument --exp-id: '-1' is not an integer >= 0"),
+        ("--seed -1", "argument --seed: '-1' is not an integer within [0, 2**32)"),
+    ],
+)
+def test_wrong_numbers_are_named(options: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        report.main(["--folder", str(tmp_path), *options.split()])
+    assert message in capsys.readouterr().err
+
+
 def test_missing_run_names_the_folder_and_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match=r"No run of cgp on Pendulum-v1 in .*cgp: .*`make train ALGO=cgp") as error:
         report.main(["--folder", str(tmp_path)])

@@ -26,6 +26,32 @@ def count(text: str) -> int:
     return int(text)
 
 
+def natural(text: str) -> int:
+    """
+    Read a natural number.
+
+    :param text: the argument
+    :return: the number, at least 0
+    :raises argparse.ArgumentTypeError: if it is no integer of at least 0
+    """
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not an integer >= 0")
+    return int(text)
+
+
+def seed(text: str) -> int:
+    """
+    Read a seed that NumPy takes.
+
+    :param text: the argument
+    :return: the seed
+    :raises argparse.ArgumentTypeError: if it is no integer within [0, 2**32)
+    """
+    if not text.isdecimal() or int(text) >= 2**32:
+        raise argparse.ArgumentTypeError(f"{text!r} is not an integer within [0, 2**32)")
+    return int(text)
+
+
 def device(text: str) -> th.device:
     """
     Read the name of a device, and check that it is available.

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch as th
 
-from benchmark.common.arguments import add_epilog, continuous_environment, count, device, output_folder
+from benchmark.common.arguments import add_epilog, continuous_environment, count, device, output_folder, seed
 from benchmark.common.files import publish
 from benchmark.common.provenance import conditions
 
@@ -36,7 +36,7 @@ def measuring_parser(
     add("--threads", count, 1, "PyTorch's threads")
     add("--device", device, "auto", "device of the networks")
     if with_seed:
-        add("--seed", int, 0, "seed of the random numbers")
+        add("--seed", seed, 0, "seed of the random numbers")
     add("--folder", output_folder, f"results/{name}", "folder of the results")
     examples = [name, *([f"{name} {example}"] if example else [])]
     add_epilog(
