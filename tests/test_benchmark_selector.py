@@ -132,7 +132,7 @@ def test_outer_and_hidden_products_are_all_that_a_call_multiplies(monkeypatch, s
         assert (left.dtype, out.shape) == (th.float32, (left.shape[0], right.shape[1]))
         counted.append(2 * left.shape[0] * left.shape[1] * right.shape[1])
 
-    run = products.outer_products(sizes, CPU)
+    run = products.first_and_last_layer_products(sizes, CPU)
     monkeypatch.setattr(th, "mm", multiply)
     run()
     assert sum(counted) + products.product_flops(sizes) == products.call_flops(sizes)

@@ -126,7 +126,7 @@ def test_printed_sweep_commands_name_a_folder_that_is_not_the_default(monkeypatc
 @pytest.mark.skipif(shutil.which("git") is None or not (ROOT / ".git").exists(), reason="needs a clone")
 def test_the_results_of_a_user_are_not_tracked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    folders = [sweep.parse(["e3"]).results, command.FOLDER, measuring_parser("runtime", "").parse_args([]).folder]
+    folders = [sweep.parse(["e3"]).results, command.FOLDER, measuring_parser("runtime", "", "", "").parse_args([]).folder]
     assert folders == [Path("results/sweeps"), Path("results/sweeps"), Path("results/runtime")]
     for folder in folders:
         assert subprocess.run(["git", "check-ignore", "-q", f"{folder}/results.md"], cwd=ROOT, check=False).returncode == 0

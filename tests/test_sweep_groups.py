@@ -242,7 +242,7 @@ def test_the_time_of_a_run_that_another_storage_began_is_not_known(tmp_path, siz
 
 
 def test_the_size_of_a_population(monkeypatch):
-    assert (parse(["e6"]).population, parse(["e6", "--population"]).population) == ("auto", "auto")
+    assert parse(["e6"]).population == "auto"
     assert (population_size("auto", "cpu"), population_size(5, "cpu")) == (1, 5)
     monkeypatch.setattr("benchmark.sweeps.groups.get_device", lambda device: type("Device", (), {"type": "cuda"}))
     assert (population_size("auto", "auto"), population_size(5, "cuda")) == (ON_GPU, 5)

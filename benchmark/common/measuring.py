@@ -16,16 +16,16 @@ TIME_OVER = 124
 
 
 def measuring_parser(
-    name: str, description: str, with_seed: bool = True, example: str = "", duration: str = ""
+    name: str, description: str, example: str, duration: str, with_seed: bool = True
 ) -> argparse.ArgumentParser:
     """
     Return the parser of a command that measures.
 
     :param name: the command's module within ``benchmark``
     :param description: the command's description
-    :param with_seed: whether the command takes one seed; False for a command that takes several
     :param example: options of an example, a shorter measurement
     :param duration: the time that the command takes without options, as text
+    :param with_seed: whether the command takes one seed; False for a command that takes several
     :return: the parser, with the arguments of all such commands
     """
     parser = argparse.ArgumentParser(prog=f"python -m benchmark.{name}", description=description)
@@ -38,11 +38,10 @@ def measuring_parser(
     if with_seed:
         add("--seed", seed, 0, "seed of the random numbers")
     add("--folder", output_folder, f"results/{name}", "folder of the results")
-    examples = [name, *([f"{name} {example}"] if example else [])]
     add_epilog(
         parser,
-        "examples:\n" + "\n".join(f"  python -m benchmark.{command}" for command in examples),
-        *([f"It takes {duration}."] if duration else []),
+        f"examples:\n  python -m benchmark.{name}\n  python -m benchmark.{name} {example}",
+        f"It takes {duration}.",
         f"The table or picture and its data are written to --folder. This repository's own are in benchmark/results/{name}.",
     )
     return parser

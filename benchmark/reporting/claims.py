@@ -11,7 +11,6 @@ from benchmark.reporting.comparisons import RANDOM, task_difference
 from benchmark.reporting.copies import without_copies
 from benchmark.reporting.estimates import (
     FEWEST_RUNS,
-    REPETITIONS,
     Estimate,
     Statistic,
     compare,
@@ -49,7 +48,7 @@ the intervals of the tables of differences; a task with fewer than {FEWEST_RUNS}
 this project's experiments count, as their files' names say, and E10 does not, as its tasks are not the paper's."""
 
 
-def findings(table: pd.DataFrame, runtime: dict[str, Any] | None, repetitions: int = REPETITIONS) -> list[Finding]:
+def findings(table: pd.DataFrame, runtime: dict[str, Any] | None, repetitions: int) -> list[Finding]:
     """
     Test all claims.
 

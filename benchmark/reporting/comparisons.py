@@ -12,7 +12,6 @@ from benchmark.common.tables import markdown_table
 from benchmark.reporting.copies import without_copies
 from benchmark.reporting.estimates import (
     FEWEST_RUNS,
-    REPETITIONS,
     Estimate,
     compare,
     in_common,
@@ -169,7 +168,7 @@ def _seeds(runs: pd.DataFrame, method: str) -> int:
     return int((runs["method"] == method).sum())
 
 
-def improvement_table(table: pd.DataFrame, subject: str, methods: Sequence[str], repetitions: int = REPETITIONS) -> str:
+def improvement_table(table: pd.DataFrame, subject: str, methods: Sequence[str], repetitions: int) -> str:
     """
     Tabulate the probability that a method improves on each other method.
 

@@ -13,7 +13,6 @@ from benchmark.common.canvas import BAND, SEED, count_steps, draw_line, legend, 
 from benchmark.common.style import styles
 from benchmark.reporting.comparisons import RANDOM
 from benchmark.reporting.estimates import (
-    REPETITIONS,
     bootstrap,
     cells_of,
     estimate,
@@ -30,7 +29,7 @@ RUNS_THAT_REACH_IT = "runs that reach it, %"
 
 
 @styled
-def stability(table: pd.DataFrame, methods: Sequence[str], repetitions: int = REPETITIONS) -> bytes:
+def stability(table: pd.DataFrame, methods: Sequence[str], repetitions: int) -> bytes:
     """
     Draw the share of runs that reach at least a reward, with its 95 % band, over the rewards at which methods differ.
 
@@ -129,7 +128,7 @@ def sensitivity(study: Study, task: str) -> bytes:
 
 
 @styled
-def values(study: Study, table: pd.DataFrame, task: str, repetitions: int = REPETITIONS) -> bytes:
+def values(study: Study, table: pd.DataFrame, task: str, repetitions: int) -> bytes:
     """
     Draw a task's final returns against each axis: interquartile means over all runs with a value, with 95 % intervals.
 
@@ -166,7 +165,7 @@ def values(study: Study, table: pd.DataFrame, task: str, repetitions: int = REPE
 
 
 @styled
-def final_rewards(study: Study, table: pd.DataFrame, repetitions: int = REPETITIONS) -> bytes:
+def final_rewards(study: Study, table: pd.DataFrame, repetitions: int) -> bytes:
     """
     Draw the final returns of a study without axes: each run's, and their interquartile mean with its 95 % interval.
 

@@ -57,9 +57,7 @@ class Estimate:
         return f"{self.value:{form}} ({low:{form}} to {high:{form}})"
 
 
-def bootstrap(
-    statistic: Statistic, groups: Sequence[Cells], repetitions: int = REPETITIONS
-) -> tuple[np.ndarray, np.ndarray | None]:
+def bootstrap(statistic: Statistic, groups: Sequence[Cells], repetitions: int) -> tuple[np.ndarray, np.ndarray | None]:
     """
     Estimate a statistic of groups of runs, drawing runs within each cell (a task and a configuration), not across cells. A
     cell that several groups have is drawn once for all of them.
@@ -97,7 +95,7 @@ def bootstrap(
     return value, np.percentile(statistic(*pooled), [2.5, 97.5], axis=0)
 
 
-def estimate(statistic: Statistic, groups: Sequence[Cells], repetitions: int = REPETITIONS) -> Estimate:
+def estimate(statistic: Statistic, groups: Sequence[Cells], repetitions: int) -> Estimate:
     """
     Estimate one number, as :func:`bootstrap` does.
 

@@ -72,19 +72,19 @@ def figures(folders: Sequence[Path], out: Path = FOLDER, repetitions: int = REPE
     if len(set(names)) < len(names):
         raise ValueError(f"Two of these studies have the same name: {', '.join(names)}")
     print(f"Drawing the figures of {', '.join(names)} into {out / FIGURES}", file=sys.stderr, flush=True)
-    in_earnest = without_side_runs(studies)
-    together = stability_together(in_earnest, repetitions)
+    main_studies = without_side_runs(studies)
+    together = stability_together(main_studies, repetitions)
     pictures = [draw(study, repetitions) for study in studies]
     for picture in [*together, *itertools.chain(*pictures)]:
         write_atomically(out / picture.path, picture.content)
     if with_page:
-        write_atomically(out / PAGE, page_of(studies, in_earnest, together, pictures, out, repetitions).encode())
+        write_atomically(out / PAGE, page_of(studies, main_studies, together, pictures, out, repetitions).encode())
     return out / PAGE
 
 
 def page_of(
     studies: Sequence[Study],
-    in_earnest: Sequence[Study],
+    main_studies: Sequence[Study],
     together: Sequence[Picture],
     pictures: Sequence[Sequence[Picture]],
     out: Path,
@@ -94,7 +94,7 @@ def page_of(
     Write the page of studies.
 
     :param studies: the studies
-    :param in_earnest: those of them that claims rest on
+    :param main_studies: those of them that claims rest on
     :param together: the figures of several studies together
     :param pictures: the figures of each study
     :param out: the folder of the page and the figures
@@ -104,14 +104,14 @@ def page_of(
     with_claims = any(is_papers(study) for study in studies)
     claims = []
     if with_claims:
-        judged = score_table([study for study in in_earnest if is_papers(study)])
+        judged = score_table([study for study in main_studies if is_papers(study)])
         claims = [claims_section(findings(judged, read_runtime(out), repetitions))]
     folders = [study.folder for study in studies]
     command = command_line([] if folders == study_folders(out) else folders, out, repetitions)
     found = [
         overview(studies, repetitions),
-        light_section(in_earnest),
-        experiments_section(in_earnest),
+        light_section(main_studies),
+        experiments_section(main_studies),
     ]
     pooled = [pooled_section(picture, f"{command} {FIGURES_ONLY}") for picture in together]
     results = []
@@ -146,7 +146,7 @@ def read_runtime(out: Path) -> dict[str, Any] | None:
     return read_json(path, ["methods"], remedy) if path.is_file() else None
 
 
-def draw(study: Study, repetitions: int = REPETITIONS) -> list[Picture]:
+def draw(study: Study, repetitions: int) -> list[Picture]:
     """
     Draw a study's figures: with axes, its stability and its sensitivity; without, its learning curves and final returns.
 
@@ -237,7 +237,7 @@ def task_names(tasks: Sequence[str]) -> dict[str, str]:
     return {task: name if count[name] == 1 else f"{name}-{zlib.crc32(task.encode()):08x}" for task, name in names.items()}
 
 
-def stability_together(studies: Sequence[Study], repetitions: int = REPETITIONS) -> list[Picture]:
+def stability_together(studies: Sequence[Study], repetitions: int) -> list[Picture]:
     """
     Draw the stability of several sweeps together.
 

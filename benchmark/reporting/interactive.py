@@ -8,7 +8,14 @@ import numpy as np
 from benchmark.common.records import Record
 from benchmark.common.style import styles
 from benchmark.reporting.estimates import REPETITIONS, bootstrap, interquartile_mean
-from benchmark.reporting.learning_curves import MOST, Times, first_training_step, learnt_range, shown_methods, times_of
+from benchmark.reporting.learning_curves import (
+    MAX_CURVES_PER_PANEL,
+    Times,
+    first_training_step,
+    learnt_range,
+    shown_methods,
+    times_of,
+)
 from benchmark.reporting.literature import published
 from benchmark.reporting.scores import Study, curves, evaluation_grid, floors
 from benchmark.reporting.verdicts import SHOWN_FIRST
@@ -35,10 +42,10 @@ def figure(study: Study, task: str, repetitions: int = REPETITIONS) -> dict[str,
     data: list[Trace] = []
     methods = shown_methods(study, task)
     # The others wait in the legend, so that the figure can be read
-    first = [method for method in SHOWN_FIRST if method in methods] or methods[:MOST]
+    first = [method for method in SHOWN_FIRST if method in methods] or methods[:MAX_CURVES_PER_PANEL]
     for method in methods:
         runs = [record for record in study.records if (record.task, record.method) == (task, method)]
-        visible = True if len(methods) <= MOST or method in first else "legendonly"
+        visible = True if len(methods) <= MAX_CURVES_PER_PANEL or method in first else "legendonly"
         traces = _method(study, runs, times, repetitions)
         data += [trace | {"visible": visible} for trace in traces]
     data += [_literature(entry) for entry in published(task, study.facts["steps"])]

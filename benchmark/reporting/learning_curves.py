@@ -12,20 +12,20 @@ from benchmark.common.canvas import BAND, count_steps, draw_line, draw_seeds, la
 from benchmark.common.records import Record, entries_by_task
 from benchmark.common.style import styles
 from benchmark.reporting.comparisons import RANDOM
-from benchmark.reporting.estimates import REPETITIONS, bootstrap, interquartile_mean
+from benchmark.reporting.estimates import bootstrap, interquartile_mean
 from benchmark.reporting.literature import Published, published
 from benchmark.reporting.machines import processors_of_run, processors_of_runs
 from benchmark.reporting.scores import Study, curves, evaluation_grid, failed, floors
 
 # The most curves in one panel; a study of more methods has a panel for each, beside the same reference
-MOST = 4
+MAX_CURVES_PER_PANEL = 4
 REFERENCE = "TD3"
 BESIDE: dict[str, Any] = dict(color="#8A8A8A", linestyle="--", linewidth=1.6)
 ALONE = (5.6, 3.6)
 
 
 @styled
-def curves_by_steps(study: Study, task: str, repetitions: int = REPETITIONS) -> bytes:
+def curves_by_steps(study: Study, task: str, repetitions: int) -> bytes:
     """
     Draw a task's learning curves: every seed, their interquartile mean, and its 95 % interval. Published mean returns within
     the range of steps are open markers.
@@ -49,7 +49,7 @@ def curves_by_steps(study: Study, task: str, repetitions: int = REPETITIONS) -> 
 
 
 @styled
-def curves_by_minutes(study: Study, task: str, repetitions: int = REPETITIONS) -> bytes:
+def curves_by_minutes(study: Study, task: str, repetitions: int) -> bytes:
     """
     Draw a task's learning curves by processor time: the same, without runs that have no time.
 
@@ -191,7 +191,7 @@ def _figure(
     floor, grid = floors(study.records)[task], evaluation_grid(records, task)
     lines = {method: curves(runs, floor, grid) for method, runs in by_method.items()}
     looks = styles(study.methods)
-    is_alone = len(by_method) <= MOST
+    is_alone = len(by_method) <= MAX_CURVES_PER_PANEL
     figure, axes = panels(1, size=ALONE) if is_alone else panels(len(by_method), columns=3)
     drawn = {"": axes[0]} if is_alone else dict(zip(by_method, axes, strict=True))
     reference = REFERENCE if REFERENCE in by_method else next(iter(by_method))

@@ -19,7 +19,6 @@ from benchmark.reporting.comparisons import (
 from benchmark.reporting.copies import without_copies
 from benchmark.reporting.estimates import (
     FEWEST_RUNS,
-    REPETITIONS,
     Estimate,
     cells_of,
     estimate,
@@ -48,7 +47,7 @@ class Level:
     reward: Estimate
 
 
-def overview(studies: Sequence[Study], repetitions: int = REPETITIONS) -> str:
+def overview(studies: Sequence[Study], repetitions: int) -> str:
     """
     Tabulate what each study found on each task.
 
@@ -74,7 +73,7 @@ def overview(studies: Sequence[Study], repetitions: int = REPETITIONS) -> str:
     return "\n\n".join(["## Findings by task", table_, NOTE])
 
 
-def finding(study: Study, table: pd.DataFrame, task: str, repetitions: int = REPETITIONS) -> str:
+def finding(study: Study, table: pd.DataFrame, task: str, repetitions: int) -> str:
     """
     Say which method ended highest on a task, and how the methods of interest differ from the others.
 

@@ -14,7 +14,7 @@ from benchmark.common.records import RUNS
 from benchmark.common.tables import markdown_table
 from benchmark.reporting.comparisons import differences_table, improvement_table, subjects_of
 from benchmark.reporting.copies import without_copies
-from benchmark.reporting.estimates import FEWEST_RUNS, REPETITIONS, cells_of, estimate, interquartile_mean, number_format
+from benchmark.reporting.estimates import FEWEST_RUNS, cells_of, estimate, interquartile_mean, number_format
 from benchmark.reporting.literature import literature_section
 from benchmark.reporting.machines import different_processors
 from benchmark.reporting.scores import Study, experiment_number, failed, score_table
@@ -80,9 +80,7 @@ def heading(study: Study, task: str | None = None) -> str:
     return f"{task}: {text}" if task is not None else text[0].upper() + text[1:]
 
 
-def study_sections(
-    study: Study, pictures: Sequence[Picture], command: str, out: Path, repetitions: int = REPETITIONS
-) -> list[str]:
+def study_sections(study: Study, pictures: Sequence[Picture], command: str, out: Path, repetitions: int) -> list[str]:
     """
     Report on a study: in a section for each task; before them, for several tasks, in one on all of them.
 
@@ -214,7 +212,7 @@ def conditions_fold(study: Study, command: str, out: Path) -> str:
     )
 
 
-def comparison_tables(table: pd.DataFrame, study: Study, repetitions: int = REPETITIONS) -> list[str]:
+def comparison_tables(table: pd.DataFrame, study: Study, repetitions: int) -> list[str]:
     """
     Compare the methods of a study.
 
@@ -239,7 +237,7 @@ def comparison_tables(table: pd.DataFrame, study: Study, repetitions: int = REPE
     return parts
 
 
-def reward_tables(table: pd.DataFrame, study: Study, repetitions: int = REPETITIONS) -> list[str]:
+def reward_tables(table: pd.DataFrame, study: Study, repetitions: int) -> list[str]:
     """
     Tabulate final returns: by method, and, in a section that is folded, by configuration.
 

@@ -8,14 +8,14 @@ from matplotlib.ticker import EngFormatter
 from benchmark.common.canvas import BAND, draw_line, draw_seeds, legend, panels, png, styled
 from benchmark.common.style import styles
 from benchmark.reporting.drawing import RUNS_THAT_REACH_IT, draw_stability
-from benchmark.reporting.estimates import REPETITIONS, bootstrap, interquartile_mean
+from benchmark.reporting.estimates import bootstrap, interquartile_mean
 from benchmark.reporting.learning_curves import show_learnt_range
 from benchmark.reporting.scores import Study, curves, evaluation_grid, floors, score_table
 from benchmark.reporting.verdicts import SHOWN_FIRST
 
 
 @styled
-def summary(learning: Study, sweep: Study, repetitions: int = REPETITIONS) -> bytes:
+def summary(learning: Study, sweep: Study, repetitions: int) -> bytes:
     """
     Draw the learning curves of a study's first task, and the stability curves of a sweep's.
 

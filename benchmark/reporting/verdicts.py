@@ -73,13 +73,6 @@ class Finding:
         counted = f"; {self.verdict} in {len(alike)} of {len(with_seeds)} comparisons"
         return alike[0].text + counted * (len(with_seeds) > 1)
 
-    @property
-    def text(self) -> str:
-        """The text of all parts, each with its verdict if there are several."""
-        if len(self.parts) == 1:
-            return self.parts[0].whole_text
-        return "; ".join(f"{part.whole_text}: {part.verdict}" for part in self.parts)
-
 
 def judge(found: Estimate, more_than: float = -np.inf, less_than: float = np.inf) -> str:
     """

@@ -10,7 +10,7 @@ import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
-from benchmark.speed.products import LIGHT, Sizes, bare_products, call_flops, outer_products, product_flops
+from benchmark.speed.products import LIGHT, Sizes, bare_products, call_flops, first_and_last_layer_products, product_flops
 from benchmark.speed.timing import interleaved, ratio, summary
 from sb3_cgp.core.cem import CEM, Score
 from sb3_cgp.core.policies import repeated_q_score
@@ -72,7 +72,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     runs: dict[tuple[Sizes, str, str], Callable[[], object]] = {}
     for sizes in all_sizes:
         runs[sizes, "plain", ""] = cem_call(sizes, repeated_q_score, args.device)
-        runs[sizes, "outer", ""] = outer_products(sizes, args.device)
+        runs[sizes, "outer", ""] = first_and_last_layer_products(sizes, args.device)
         for dtype in args.dtypes:
             runs[sizes, dtype, "call"] = cem_call(sizes, partial(q_score, dtype=DTYPES[dtype]), args.device)
             for way, product in bare_products(sizes, DTYPES[dtype], args.device).items():

@@ -73,7 +73,7 @@ def product_flops(sizes: Sizes) -> int:
     return 2 * sizes.iterations * sizes.actions * sizes.width**2
 
 
-def outer_products(sizes: Sizes, device: th.device) -> Callable[[], object]:
+def first_and_last_layer_products(sizes: Sizes, device: th.device) -> Callable[[], object]:
     """
     Return the call's other products, all in float32: once the states' part of the first layer; per iteration the actions'
     part, (B N, A) times (A, H), and the last layer, (B N, H) times (H, 1). Operands and results are allocated here, once.

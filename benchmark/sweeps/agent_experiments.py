@@ -33,9 +33,5 @@ class AgentExperiment(ExperimentManager):
         self.arguments = hyperparams
 
 
-class NewAgent(AgentExperiment):
-    """rl_zoo3's manager of an agent's run that starts."""
-
-
 class ResumedAgent(AgentExperiment, ResumedExperiment):
     """rl_zoo3's manager of an agent's run that continues."""

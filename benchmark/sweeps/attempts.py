@@ -15,7 +15,7 @@ from benchmark.sweeps.tuning import SCORES
 # error ended which may be another run's
 SUSPECT, DISSOLVED = "given back after an error: ", "dissolved: "
 # Attempts one after another without progress after which a run is given up
-MOST = 3
+MAX_FRUITLESS_ATTEMPTS = 3
 # Errors that every run of the machine would have
 OF_ALL_RUNS = (StorageError, th.AcceleratorError)
 # Of a disk that is full, read-only, broken or gone, and of too many open files

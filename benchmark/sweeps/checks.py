@@ -18,6 +18,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from benchmark.common.zoo import random_steps, silence
+from benchmark.sweeps.attempts import in_words
 from benchmark.sweeps.experiments import Sweep
 from benchmark.sweeps.hyperparameters import problems
 from benchmark.sweeps.runs import Run
@@ -44,7 +45,7 @@ def check_values(sweep: Sweep) -> None:
             model = construct(run)
         except Exception as error:
             place = f"{run.configuration} on {run.task}"
-            raise SweepError(sweep.path or sweep.name, place, f"no model can be made: {_in_words(error)}") from error
+            raise SweepError(sweep.path or sweep.name, place, f"no model can be made: {in_words(error)}") from error
         found |= dict.fromkeys(_doubts(run, model))
     for doubt in found:
         print(f"Warning: {sweep.path or sweep.name}: {doubt}", file=sys.stderr)
@@ -87,17 +88,13 @@ def check_tuning(tuning: Tuning) -> None:
         except Exception as error:
             errors.append(error)
     if len(errors) == N_SAMPLES:
-        raise SweepError("The tuned configurations", "", f"no model can be made: {_in_words(errors[0])}") from errors[0]
+        raise SweepError("The tuned configurations", "", f"no model can be made: {in_words(errors[0])}") from errors[0]
     if errors:
         print(
-            f"Warning: of {N_SAMPLES} sampled configurations, {len(errors)} cannot be trained ({_in_words(errors[0])}). "
+            f"Warning: of {N_SAMPLES} sampled configurations, {len(errors)} cannot be trained ({in_words(errors[0])}). "
             "Trials of these fail, and count for --trials: to avoid them, set the hyperparameter that contradicts by --set",
             file=sys.stderr,
         )
-
-
-def _in_words(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
 
 
 def _representatives(sweep: Sweep) -> Iterator[Run]:

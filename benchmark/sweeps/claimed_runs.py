@@ -4,7 +4,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
-from benchmark.sweeps.attempts import DISSOLVED, MOST, in_words, outcome_of
+from benchmark.sweeps.attempts import DISSOLVED, MAX_FRUITLESS_ATTEMPTS, in_words, outcome_of
 from benchmark.sweeps.heartbeats import TrialLostError
 from benchmark.sweeps.runs import Run
 from benchmark.sweeps.studies import Ledger
@@ -144,7 +144,9 @@ class ClaimedRuns:
         :param error: the error
         :return: whether it is to be taken for an error of the run's own; never for one that every run would have
         """
-        return outcome_of(error) != STOPPED and any(self._ledger.fruitless(claim) >= MOST for claim in self._open.values())
+        return outcome_of(error) != STOPPED and any(
+            self._ledger.fruitless(claim) >= MAX_FRUITLESS_ATTEMPTS for claim in self._open.values()
+        )
 
     def dissolve(self, error: BaseException) -> None:
         """

@@ -56,13 +56,11 @@ def add_population(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument(
         "--population",
-        nargs="?",
-        const="auto",
         default="auto",
         type=_size,
         metavar="N",
-        help="most runs that a process trains together, as agents of one population. Without N, and by default, it is "
-        f"{ON_GPU} on a GPU and 1, each run alone, on a CPU, where a population gains nothing",
+        help="most runs that a process trains together, as agents of one population (default: "
+        f"{ON_GPU} on a GPU and 1, each run alone, on a CPU, where a population gains nothing)",
     )
 
 

@@ -10,9 +10,9 @@ from rl_zoo3 import ALGOS
 
 from benchmark.sweeps.random_actions import NAME as RANDOM
 
-# The keys of an entry that rl_zoo3 uses itself, without the steps; all others are arguments of the algorithm
+# Keys of an entry that rl_zoo3 reads itself, beside the algorithm's arguments, without the steps
 ZOO_HYPERPARAMS = ("frame_stack", "n_envs", "noise_std", "noise_type", "normalize", "policy_kwargs")
-# Of these, the arguments of other code, in which text may look like a number
+# Further ones, which hold the arguments of other code, in which text may look like a number
 FOREIGN_ARGUMENTS = ("callback", "env_kwargs", "env_wrapper", "monitor_kwargs", "vec_env_wrapper")
 # The hyperparameters that rl_zoo3 takes as text, too: "lin_0.001" is a schedule
 SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")

@@ -17,7 +17,7 @@ from stable_baselines3.common.utils import get_device, set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from benchmark.common.records import EVALUATION_SEED, FINAL_EPISODES
-from benchmark.sweeps.agent_experiments import AgentExperiment, NewAgent, ResumedAgent
+from benchmark.sweeps.agent_experiments import AgentExperiment, ResumedAgent
 from benchmark.sweeps.claimed_runs import ClaimedRuns
 from benchmark.sweeps.environment_processes import classified_deaths, close_environments
 from benchmark.sweeps.groups import Group
@@ -110,7 +110,7 @@ def _experiment(run: Run, folder: Path, device: str, continues: bool) -> AgentEx
     # The states are not in the run's folder, which a user may have removed after the run's end
     if continues and has_settings(folder):
         return resumed_experiment(ResumedAgent, run, folder, device)
-    return new_experiment(NewAgent, run, folder, device)
+    return new_experiment(AgentExperiment, run, folder, device)
 
 
 def _join(

@@ -78,7 +78,7 @@ class StudyView:
         :return: their records
         """
         trials = self.trials()
-        experiment = self.description()["experiment"]
+        experiment = self.storage.get_study_user_attrs(self.study_id)[SWEEP]["experiment"]
         of_run: dict[str, list[FrozenTrial]] = defaultdict(list)
         for trial in trials:
             of_run[trial.user_attrs[KEY]].append(trial)

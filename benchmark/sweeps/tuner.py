@@ -18,7 +18,7 @@ from optuna.samplers import TPESampler
 from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState
 
-from benchmark.sweeps.attempts import MOST, SUSPECT, fruitless, in_words, outcome_of
+from benchmark.sweeps.attempts import MAX_FRUITLESS_ATTEMPTS, SUSPECT, fruitless, in_words, outcome_of
 from benchmark.sweeps.heartbeats import HeartbeatThread, SilenceDetector, TrialLostError, send_beat
 from benchmark.sweeps.locks import locked
 from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, run_folder, train
@@ -89,7 +89,7 @@ class Tuner:
     def _give_back(self, number: int, outcome: str) -> None:
         trial_id = self._id(number)
         try:
-            if outcome != STOPPED and fruitless(self._attempts(number)) >= MOST:
+            if outcome != STOPPED and fruitless(self._attempts(number)) >= MAX_FRUITLESS_ATTEMPTS:
                 self._storage.set_trial_user_attr(trial_id, ERROR, outcome.removeprefix(SUSPECT))
             self._storage.set_trial_user_attr(trial_id, OUTCOME, outcome)
             self._storage.set_trial_state_values(trial_id, TrialState.FAIL)
