@@ -13,11 +13,12 @@ from sb3_cgp import CEM, CGPPolicy
 from sb3_cgp.core.losses import POLICY_LOSSES
 from sb3_cgp.population import Population, evaluate_population
 
+NOISE = NormalActionNoise(np.zeros(2), np.ones(2))
 ORNSTEIN_UHLENBECK = OrnsteinUhlenbeckActionNoise(np.zeros(2), np.ones(2))
 
 
-def set_on_population(name, value):
-    population = make(2)
+def set_on_population(name, value, **arguments):
+    population = make(2, **arguments)
     before = getattr(population, name, None)
     try:
         setattr(population, name, value)
@@ -62,7 +63,7 @@ def set_on_population(name, value):
         (
             lambda: make(
                 [
-                    dict(action_noise=NormalActionNoise(np.zeros(2), np.ones(2))),
+                    dict(action_noise=NOISE),
                     dict(action_noise=ORNSTEIN_UHLENBECK),
                 ]
             ),
@@ -74,6 +75,14 @@ def set_on_population(name, value):
         (lambda: set_on_population("cem_iterations", 5), "cem_iterations"),
         (lambda: set_on_population("tau", 0.9), "tau"),
         (lambda: set_on_population("learning_rate", 0.1), "learning_rate"),
+        (lambda: set_on_population("overlap", True), "overlap"),
+        (lambda: set_on_population("overlap", True, train_freq=2), "overlap"),
+        (lambda: set_on_population("overlap", False, overlap=True), "overlap"),
+        (lambda: set_on_population("agents", [dict(tau=0.9)] * 2), "agents"),
+        (lambda: set_on_population("policy_kwargs", dict(net_arch=[4])), "policy_kwargs"),
+        (lambda: set_on_population("action_noise", NOISE), "action_noise"),
+        (lambda: set_on_population("action_noise", None, action_noise=NOISE), "action_noise"),
+        (lambda: set_on_population("action_noise", None, action_noise=ORNSTEIN_UHLENBECK), "action_noise"),
         (lambda: make(3).predict(np.zeros((2, 3))), "observation"),
         (lambda: evaluate_population(make(3), make_env(2)), "env.num_envs"),
     ],

@@ -14,6 +14,7 @@ from sb3_cgp.algorithm import CGP
 from sb3_cgp.common.load_arguments import saved_attributes
 from sb3_cgp.common.rules import require
 from sb3_cgp.common.sb3_arguments import as_schedule
+from sb3_cgp.core.cem import ActionSelector
 from sb3_cgp.core.policies import CGPPolicy
 from sb3_cgp.guards.argument_names import suggests_names
 from sb3_cgp.guards.file_names import find_file
@@ -39,7 +40,7 @@ from sb3_cgp.resumption.algorithm import ResumableAlgorithm
 SelfPopulation = TypeVar("SelfPopulation", bound="Population")
 
 # The arguments that are fixed when a population is made. SB3 and the user may set the others on it.
-FIXED = {*OWN, *COMMON} - {"seed", "action_noise", "policy_kwargs", "stats_window_size", "tensorboard_log", "verbose"}
+FIXED = {"agents", "overlap", *OWN, *COMMON} - {"seed", "stats_window_size", "tensorboard_log", "verbose"}
 
 
 class Population(ResumableAlgorithm, PopulationMembers):
@@ -66,6 +67,8 @@ class Population(ResumableAlgorithm, PopulationMembers):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = CGP.policy_aliases
     # For TensorBoard's tab HParams. SB3's attributes, such as `gamma`, have not the agents' values, which are in `agents`.
     hyperparameter_names: ClassVar[tuple[str, ...]] = ("agents", "overlap", "device")
+    # That of the policy when the population was saved
+    _saved_selector: ActionSelector | None = None
 
     def __init__(
         self,
@@ -128,9 +131,13 @@ class Population(ResumableAlgorithm, PopulationMembers):
         self.learning_starts = n_agents * min(agent.learning_starts for agent in agents)
         # SB3 makes a policy, which is replaced below: the random numbers that follow are those of an agent alone
         super()._setup_model()
+        # A loaded population has its noise, with a state
         if self.action_noise is None:
             self.action_noise = join_action_noise(agents)
+        # From here on, the arguments are fixed
         self.policy = PopulationPolicy(*spaces, agents).to(self.device)  # type: ignore[arg-type]
+        if self._saved_selector is not None:
+            self.policy.selector = self._saved_selector
         self._choose_inference()
         self._schedules = [(agent.lr_schedule, agent.actor_lr_schedule) for agent in agents]
         self._numbers = AgentNumbers.of(agents, self.device)
@@ -138,32 +145,28 @@ class Population(ResumableAlgorithm, PopulationMembers):
         self._counts = {name: np.array([getattr(agent, name) for agent in agents]) for name in names}
         self._recorded = {}
         self._unlogged = {}
-        self._initial_selector = self.policy.selector
 
     def __setattr__(self, name: str, value: Any) -> None:
         """
-        Set an attribute, unless it is an argument of the agents, whose change would have no effect.
+        Set an attribute, unless it is an argument of the population or of its agents, which would then contradict each other.
 
         :param name: the attribute's name
         :param value: its value
-        :raises ValueError: if the population is made and the attribute is an argument of the agents
+        :raises ValueError: if the population is made and the attribute is such an argument
         """
-        allowed = "left as it is in a population that is made: make another one, or set it on `population.agent(i, env)`"
-        require(name not in FIXED or "_initial_selector" not in vars(self), name, value, allowed)
+        advice = "make another one, or set an agent's argument on `population.agent(i, env)`"
+        is_made = isinstance(vars(self).get("policy"), PopulationPolicy)
+        require(name not in FIXED or not is_made, name, value, f"left as it is in a population that is made: {advice}")
         super().__setattr__(name, value)
 
     def save(self, *args: Any, **kwargs: Any) -> None:
         """
-        Save the population, with a selector that has been set on its policy, see SB3's method.
+        Save the population, with the selector of its policy, see SB3's method.
 
         :param args: the arguments of SB3's method
         :param kwargs: the same arguments by keyword
         """
-        selector = self.policy.selector
-        if selector is not self._initial_selector:
-            policy_kwargs = {**value_of("policy_kwargs", self.agents[0]), "selector": selector}
-            self.agents = [arguments | {"policy_kwargs": policy_kwargs} for arguments in self.agents]
-            self.policy_kwargs, self._initial_selector = policy_kwargs, selector
+        self._saved_selector = self.policy.selector
         super().save(*args, **kwargs)
 
     def set_random_seed(self, seed: int | None = None) -> None:
@@ -184,6 +187,8 @@ class Population(ResumableAlgorithm, PopulationMembers):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
         # `set_env` may have changed it
         self._check_env()
+        # The user may have set another selector on the policy
+        self[0]._check_selector()
         return super()._setup_learn(*args, **kwargs)
 
     def _check_env(self) -> None:
@@ -282,7 +287,7 @@ class Population(ResumableAlgorithm, PopulationMembers):
         super().set_env(make_agents_env(env, len(self)), force_reset)
 
     def _excluded_save_params(self) -> list[str]:
-        made = ["_schedules", "_numbers", "_counts", "_recorded", "_unlogged", "_initial_selector"]
+        made = ["_schedules", "_numbers", "_counts", "_recorded", "_unlogged"]
         return [*super()._excluded_save_params(), *made]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

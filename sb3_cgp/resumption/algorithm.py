@@ -205,7 +205,8 @@ class ResumableAlgorithm(ResumableModel):
         self._custom_logger = has_logger
         # Unless it was given to `resume`, and has just been adapted to the number of environments
         if _number_of_noises(action_noise) == _number_of_noises(self.action_noise):
-            self.action_noise = action_noise
+            # Not by `setattr`: a population refuses other noise
+            vars(self)["action_noise"] = action_noise
         return result
 
     def _continued_logger(self, name: str) -> Logger:
