@@ -1,6 +1,7 @@
 """A population's agents as ordinary models: they predict, are saved and exported, and train on."""
 
 import functools
+import io
 import warnings
 
 import numpy as np
@@ -11,8 +12,7 @@ from populations import AGENTS, Pushed, PushedOnAxes, assert_alike, make, make_e
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_cgp import CGP
-from sb3_cgp.population import Population, make_population_env
-from sb3_cgp.selectors import MPPI
+from sb3_cgp.population import make_population_env
 
 
 def test_an_agent_predicts_as_it_does_in_the_population():
@@ -94,6 +94,59 @@ def test_a_copy_of_an_agent_changes_neither_the_population_nor_its_random_number
     assert th.equal(th.get_rng_state(), state)
 
 
+@pytest.mark.parametrize(
+    "look",
+    [
+        lambda population: population[1],
+        list,
+        lambda population: population.agent(0, env=Pushed()),
+        lambda population: population[0].save(io.BytesIO()),
+    ],
+    ids=["one", "all", "with an environment", "saved"],
+)
+@pytest.mark.parametrize("agents", [2, [dict(seed=None), dict(seed=3)]], ids=["seeds", "a seed"])
+@pytest.mark.filterwarnings("ignore:Nothing is learnt")
+def test_looking_at_agents_changes_no_random_action(look, agents):
+    def random_actions(look):
+        population = make(agents)
+
+        def callback(*_):
+            look(population)
+            return True
+
+        np.random.seed(0)  # noqa: NPY002
+        th.manual_seed(0)
+        population.action_space.seed(0)
+        return population.learn(2 * 15, callback).replay_buffer.actions[:15]
+
+    np.testing.assert_array_equal(random_actions(look), random_actions(len))
+
+
+@pytest.mark.parametrize(
+    ("change", "read"),
+    [
+        (lambda agent: setattr(agent.policy.selector, "samples", 5), lambda each: each.policy.selector.samples),
+        (lambda agent: setattr(agent, "cem_samples", 5), lambda each: each.policy.selector.samples),
+        (lambda agent: agent.policy_kwargs.update(n_critics=1), lambda each: each.policy_kwargs["n_critics"]),
+        (
+            lambda agent: agent.replay_buffer_kwargs.update(handle_timeout_termination=False),
+            lambda each: each.replay_buffer_kwargs["handle_timeout_termination"],
+        ),
+        (lambda agent: agent.action_space.high.fill(9), lambda each: each.action_space.high.tolist()),
+        (lambda agent: agent.observation_space.high.fill(9), lambda each: each.observation_space.high.tolist()),
+    ],
+    ids=["selector", "its argument", "policy_kwargs", "replay_buffer_kwargs", "action space", "observation space"],
+)
+def test_what_is_changed_on_a_copy_of_an_agent_is_not_changed_in_the_population(change, read):
+    kwargs = dict(policy_kwargs=dict(n_critics=2), replay_buffer_kwargs=dict(handle_timeout_termination=True))
+    population = make(2, **kwargs)
+    before = read(population)
+    agent = population[0]
+    change(agent)
+    assert read(agent) != before
+    assert read(population) == read(population[0]) == read(population[1]) == before
+
+
 def test_an_agent_goes_on_from_its_own_transitions():
     population = make(3).learn(3 * 40)
     agent = population.agent(1, env=Pushed())
@@ -132,15 +185,6 @@ def test_raw_images_are_not_scaled():
         actions, _ = population.predict(observations)
         for index, agent in enumerate(population):
             np.testing.assert_allclose(actions[index], agent.predict(observations[index])[0], atol=1e-5)
-
-
-def test_a_selector_that_is_set_on_the_policy_is_that_of_the_agents_and_is_saved(tmp_path):
-    population = make(2)
-    population.policy.selector = MPPI(2, 6, 3)
-    assert population[1].policy.selector == MPPI(2, 6, 3)
-    population.save(tmp_path / "population")
-    loaded = Population.load(tmp_path / "population")
-    assert loaded.policy.selector == loaded[0].policy.selector == MPPI(2, 6, 3)
 
 
 def test_an_index_is_an_integer():

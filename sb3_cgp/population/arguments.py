@@ -119,12 +119,13 @@ def make_agent(
     :return: the agent
     :raises ValueError: if an argument is out of its range or contradicts another one
     """
-    # Noise may have a state. The population prints the device once.
-    own = arguments | {"action_noise": copy.deepcopy(arguments.get("action_noise")), "verbose": 0}
-    agent = CGP(policy, None, device=device, _init_setup_model=False, **own)  # type: ignore[arg-type]
+    # The user may change the dictionaries of the agent, and noise may have a state. The population prints the device once.
+    own: Arguments = {name: dict(value_of(name, arguments)) for name in ("policy_kwargs", "replay_buffer_kwargs")}
+    own |= {"action_noise": copy.deepcopy(arguments.get("action_noise")), "verbose": 0}
+    agent = CGP(policy, None, device=device, _init_setup_model=False, **(arguments | own))  # type: ignore[arg-type]
     agent.verbose = value_of("verbose", arguments)
-    # As SB3's `load` does for a model without an environment
-    agent.observation_space, agent.action_space = observation_space, action_space
+    # As SB3's `load` does for a model without an environment. Copies, as the agent's seed is set in its action space.
+    agent.observation_space, agent.action_space = copy.deepcopy((observation_space, action_space))
     agent.n_envs, agent._defers_replay_buffer = 1, True
     agent._setup_model()
     return agent

@@ -1,5 +1,6 @@
 """The agents of a population as ordinary CGPs."""
 
+import copy
 import operator
 from collections.abc import Iterator
 from typing import Any, TypeVar
@@ -99,7 +100,8 @@ class PopulationMembers(OverlappedTraining):
         # First: to a model that has not learnt, trained critics without a trained actor would be somebody else's
         agent._n_updates = int(self._agent_updates[index])
         self.policy.copy_to(agent, index)
-        agent.policy.selector = self.policy.selector
+        # A copy, whose attributes may be set. Not a deep one, as selectors may refer to what cannot be copied.
+        agent.policy.selector = copy.copy(self.policy.selector)
         agent.num_timesteps = self.num_timesteps // len(self)
         agent._current_progress_remaining = self._current_progress_remaining
         is_online = self._trains_online and agent._n_updates >= agent.policy_delay
