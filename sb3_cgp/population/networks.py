@@ -68,15 +68,6 @@ class StackedMLP(nn.Module):
                 hidden = activation(hidden)
         return hidden
 
-    def score(self, features: th.Tensor) -> "StackedScore":
-        """
-        Return the function that scores actions by the first network of each agent.
-
-        :param features: the states' features, (N, B, F)
-        :return: the scoring function, which maps actions, (N B, S, A), to values, (N B, S)
-        """
-        return StackedScore(self, features)
-
     def ordered(self) -> list[nn.Parameter]:
         """Return the parameters in the order of an ordinary network's: weight and bias of each layer."""
         return [parameter for pair in zip(self.weights, self.biases, strict=True) for parameter in pair]
@@ -84,7 +75,9 @@ class StackedMLP(nn.Module):
 
 class StackedScore:
     """
-    Scores many actions per state. The states' part of the first layer is computed once per state, as in ``fast/scoring.py``.
+    Scores actions, (N B, S, A), by the first network of each agent: values, (N B, S).
+
+    The states' part of the first layer is computed once per state, as in ``fast/scoring.py``.
 
     :param critics: critics that begin with a linear layer
     :param features: the states' features, (N, B, F)

@@ -33,8 +33,7 @@ class OverlappedTraining(PopulationTraining):
 
         :raises ValueError: if they do not
         """
-        every_step = (1, TrainFreq(1, TrainFrequencyUnit.STEP), (1, "step"))
-        follows = self.train_freq in every_step and self.gradient_steps > 0
+        follows = self.train_freq == TrainFreq(1, TrainFrequencyUnit.STEP) and self.gradient_steps > 0
         require(isinstance(self.overlap, bool), "overlap", self.overlap, "True or False")
         allowed = "False unless `train_freq` is 1 and `gradient_steps` is at least 1"
         require(follows or not self.overlap, "overlap", self.overlap, allowed)

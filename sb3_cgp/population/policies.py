@@ -20,7 +20,7 @@ from sb3_cgp.algorithm import CGP
 from sb3_cgp.common.rules import require
 from sb3_cgp.core.policies import CGPPolicy
 from sb3_cgp.population.adam import AgentAdam
-from sb3_cgp.population.networks import StackedMLP, agent_slices
+from sb3_cgp.population.networks import StackedMLP, StackedScore, agent_slices
 from sb3_cgp.selectors.proposals import takes_proposals
 
 # Returns the actions that agents take at their observations, (N, *shape)
@@ -122,7 +122,7 @@ class PopulationPolicy(BasePolicy):
         """Select each state's action, (N, B, A), by the values of some critics."""
         assert self.selector is not None
         n_rows, action_dim = features.shape[0] * features.shape[1], get_action_dim(self.action_space)
-        selection = self.selector.select(critics.score(features), n_rows, action_dim, features.device, **arguments)
+        selection = self.selector.select(StackedScore(critics, features), n_rows, action_dim, features.device, **arguments)
         return selection.actions.unflatten(0, features.shape[:2])
 
     def _where_actor(self, actions: th.Tensor, others: th.Tensor) -> th.Tensor:
