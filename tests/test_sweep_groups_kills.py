@@ -111,17 +111,17 @@ def test_states_are_removed_before_another_process_may_continue_from_them(clock,
     events = []
 
     class Lock:
-        def __init__(self, path, **_):
-            events.append("locked")
-
-        def acquire(self, timeout):
+        def __init__(self, folder):
             pass
+
+        def acquire(self):
+            events.append("locked")
 
         def release(self):
             events.append("released")
 
     forget = worker._forget
-    monkeypatch.setattr(locks, "FileLock", Lock)
+    monkeypatch.setattr(locks, "FolderLock", Lock)
     monkeypatch.setattr(worker, "_forget", lambda *args: events.append("removed") or forget(*args))
     work_through(InMemoryStorage(), make_sweep(["Good"]), clock, tmp_path, population=8)
     assert events == ["locked", "locked", "removed", "released", "released"]

@@ -81,7 +81,8 @@ class FolderLock:
         except Timeout:
             raise
         except OSError as error:
-            if not os.access(self.folder, os.W_OK):
+            # What else prevents writing to the folder is said where a state is written
+            if not (self.folder.is_dir() and os.access(self.folder, os.W_OK)):
                 return
             if error.errno not in NO_LOCKS:
                 raise
