@@ -14,6 +14,21 @@ from benchmark.compatibility.packages import PACKAGES
 from benchmark.compatibility.page import page
 
 
+def record_of(found, load_average):
+    """The record of a package with one environment."""
+    return {
+        "package": "works",
+        "installation": {"pins": "all", "seconds": 1.0},
+        "environments": {"Works-v0": found},
+        "versions": {"works": "1.2"},
+        "other_versions": {},
+        "python": "3.11.7",
+        "commit": "abc",
+        "machine": {"cpu": "A processor", "cores": 2},
+        "load_average": load_average,
+    }
+
+
 def test_a_page_has_returns_successes_and_what_was_noticed(monkeypatch):
     learning = Learning(3_000, {})
     package = Package(
@@ -32,18 +47,7 @@ def test_a_page_has_returns_successes_and_what_was_noticed(monkeypatch):
         "why_not_restorable": "a.Simulator is unknown and has no get_training_state(): it needs x. b.C is unknown and has no "
         "get_training_state(): it needs x.",
     }
-    record = {
-        "package": "works",
-        "installation": {"pins": "all", "seconds": 1.0},
-        "environments": {"Works-v0": found},
-        "versions": {"works": "1.2"},
-        "other_versions": {},
-        "python": "3.11.7",
-        "commit": "abc",
-        "machine": {"cpu": "A processor", "cores": 2},
-        "load_average": 3.4,
-    }
-    text = page({"works": record})
+    text = page({"works": record_of(found, load_average=3.4)})
     cells = ["differs", "yes (0e+00)", "80 (12,346)", "-49.5 → -1.5; 0 → 19 of 20 (3,000 steps)"]
     assert rows_of(text)["works: Works-v0"][2:] == cells
     assert rows_of(text)["works"] == ['`"works<2"`', "[code](#works)", "works 1.2"]
@@ -71,18 +75,7 @@ def test_a_page_says_no_of_an_export_that_failed_and_not_of_one_that_was_not_tri
     monkeypatch.setattr("benchmark.compatibility.page.PACKAGES", (package,))
     found = {name: value for name, value in WRITTEN.items() if name != "export_difference"}
     found |= {"errors": {"whole": errors}, "resumes": "bit for bit"}
-    record = {
-        "package": "works",
-        "installation": {"pins": "all", "seconds": 1.0},
-        "environments": {"Works-v0": found},
-        "versions": {"works": "1.2"},
-        "other_versions": {},
-        "python": "3.11.7",
-        "commit": "abc",
-        "machine": {"cpu": "A processor", "cores": 2},
-        "load_average": 0.0,
-    }
-    cells = rows_of(page({"works": record}))["works: Works-v0"]
+    cells = rows_of(page({"works": record_of(found, load_average=0.0)}))["works: Works-v0"]
     assert (cells[1], cells[3]) == (trains, exports)
 
 

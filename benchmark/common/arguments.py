@@ -1,6 +1,7 @@
 """Types of arguments: each reads a text of the command line, and refuses it by name if it is wrong."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,7 @@ def count(text: str) -> int:
     :return: the number, at least 1
     :raises argparse.ArgumentTypeError: if it is no integer of at least 1
     """
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not an integer >= 1")
-    return int(text)
+    return _integer(text, lambda number: number >= 1, ">= 1")
 
 
 def natural(text: str) -> int:
@@ -34,9 +33,7 @@ def natural(text: str) -> int:
     :return: the number, at least 0
     :raises argparse.ArgumentTypeError: if it is no integer of at least 0
     """
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is not an integer >= 0")
-    return int(text)
+    return _integer(text, lambda number: True, ">= 0")
 
 
 def seed(text: str) -> int:
@@ -47,8 +44,13 @@ def seed(text: str) -> int:
     :return: the seed
     :raises argparse.ArgumentTypeError: if it is no integer within [0, 2**32)
     """
-    if not text.isdecimal() or int(text) >= 2**32:
-        raise argparse.ArgumentTypeError(f"{text!r} is not an integer within [0, 2**32)")
+    return _integer(text, lambda number: number < 2**32, "within [0, 2**32)")
+
+
+def _integer(text: str, is_allowed: Callable[[int], bool], allowed: str) -> int:
+    """Read an integer of at least 0 that fulfils a condition."""
+    if not text.isdecimal() or not is_allowed(int(text)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not an integer {allowed}")
     return int(text)
 
 

@@ -76,8 +76,9 @@ def check_folder(args: argparse.Namespace) -> None:
     :param args: the command line
     :raises ValueError: if one has other settings, or is damaged
     """
+    asked = settings(args)
     for record in read_records(args.folder):
-        check_settings(args.folder, record["settings"], settings(args))
+        check_settings(args.folder, record["settings"], asked)
 
 
 def train_missing(args: argparse.Namespace, argv: Sequence[str]) -> None:
