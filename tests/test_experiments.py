@@ -174,6 +174,7 @@ def test_a_wrong_file_is_left_out_of_the_list(tmp_path, monkeypatch):
     files = {
         "a": "{title: A, steps: 3000}",
         "b": "{title: B, includes: [a, e1]}",
+        "c": "{title: C, steps: 1.0e+6}",
         "broken": "{",
         "no-title": "{steps: 10}",
         "no-steps": "{title: C}",
@@ -188,6 +189,7 @@ def test_a_wrong_file_is_left_out_of_the_list(tmp_path, monkeypatch):
         ["sweeps:"],
         ["a", "A,", "3,000", "steps"],
         ["b", "B", "=", "a,", "e1"],
+        ["c", "C,", "1,000,000", "steps"],
     ]
 
 

@@ -26,7 +26,7 @@ from sb3_cgp import CGP
 from sb3_cgp.common.files import write_atomically
 from sb3_cgp.fast.device_replay import DeviceReplayBuffer
 from sb3_cgp.resumption import FolderInUseError, TrainingCheckpointCallback, resumable
-from sb3_cgp.resumption.locks import FolderLock
+from sb3_cgp.resumption.locks import NO_LOCKS, FolderLock
 from sb3_cgp.resumption.replay_buffers import fill_replay_buffer, replay_buffer_state
 
 IN_USE = r"in use by another training: process \d+ on host "
@@ -85,19 +85,35 @@ def test_another_process_is_refused_and_a_killed_one_does_not_block(folder):
     CGP.resume(folder, env()).learn(40)
 
 
+@pytest.mark.parametrize("number", NO_LOCKS)
 @pytest.mark.parametrize("is_copied", [True, False])
-def test_on_a_file_system_without_locks_nothing_is_left_that_blocks(is_copied, tmp_path, fail_to_lock):
+def test_on_a_file_system_without_locks_nothing_is_left_that_blocks(is_copied, number, tmp_path, fail_to_lock):
     if is_copied:
         FolderLock(tmp_path).acquire()
         gc.collect()
         assert (tmp_path / ".lock").exists()
-    fail_to_lock()
+    fail_to_lock(number)
     for _ in range(2):
         # A killed process releases nothing
         lock = FolderLock(tmp_path)
         with pytest.warns(UserWarning, match=r"cannot be locked \(.*\): make sure that no other process uses it"):
             lock.acquire()
         assert not lock._lock.is_locked
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM])
+def test_a_lock_that_another_user_has_left_does_not_block(number, folder, monkeypatch):
+    opened = os.open
+
+    def refuse(path, *args, **kwargs):
+        if os.fspath(path).endswith(".lock"):
+            raise PermissionError(number, os.strerror(number), path)
+        return opened(path, *args, **kwargs)
+
+    monkeypatch.setattr("os.open", refuse)
+    with pytest.warns(UserWarning, match=r"cannot be locked \(.*\.lock'\): make sure that no other process uses it"):
+        model = CGP.resume(folder, env())
+    assert model.learn(40).num_timesteps == 40
 
 
 def test_a_folder_that_cannot_be_locked_for_another_reason_is_an_error(tmp_path, fail_to_lock):

@@ -61,6 +61,7 @@ def test_the_order_of_a_set_does_not_count(kind):
     assert equal(first, second)
     assert equal({"nested": [first]}, {"nested": [second]})
     assert not equal(first, {"__type__": kind.__name__, "items": ["a", "b"]})
+    assert equal(to_plain(kind([np.nan])), to_plain(kind([float("nan")])))
     assert not equal(first, {"__type__": "deque", "items": ["a", "b", "c"], "maxlen": None})
     # That of others does
     queues = [{"__type__": "deque", "items": [*items], "maxlen": None} for items in ("abc", "cab")]

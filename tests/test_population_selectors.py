@@ -1,5 +1,7 @@
 """A selector that is set on a population's policy is that of the agents, is checked by ``learn``, and is saved."""
 
+import warnings
+
 import pytest
 import torch as th
 from populations import VARIANTS, make, make_env
@@ -46,6 +48,14 @@ def test_it_is_that_of_the_agents_and_is_saved(way, variant, selector, tmp_path)
     assert loaded.learn(2 * 30).policy.selector == selector
     loaded[1].save(tmp_path / "agent")
     assert CGP.load(tmp_path / "agent").policy.selector == selector
+
+
+def test_its_check_does_not_repeat_the_warnings_of_the_constructor():
+    with pytest.warns(UserWarning, match="cem_samples=8, .*has no effect"):
+        population = make(2, cem_samples=8, policy_kwargs=dict(net_arch=[8], selector=MPPI(2, 6, 3)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        population.learn(2 * 25)
 
 
 @pytest.mark.parametrize("variant", ["CGP", "CGP-Light", "MPPI"])

@@ -16,6 +16,7 @@ from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import KEY, RUN
 from benchmark.sweeps.sweep_files import SweepFile
 from benchmark.sweeps.validation import SweepError
+from benchmark.sweeps.worker_loop import forget_ended
 
 
 def test_a_study_is_not_opened_with_other_settings(ledger):
@@ -102,8 +103,8 @@ def test_runs_that_another_version_described_are_refused_in_words(change, messag
         worker.main(["--study", "study", "--storage", url, "--logs", str(tmp_path)])
 
 
-def test_a_population_that_another_version_described_is_refused(tmp_path):
-    group = Group.of(tmp_path, make_sweep(["Good"]).runs())
+def test_a_population_that_another_version_described_is_refused_and_left_alone(ledger, tmp_path):
+    group = Group.of(tmp_path / ledger.name, make_sweep(["Good"]).runs())
     group.write()
     assert Group.read(group.folder) == group
     described = json.loads((group.folder / GROUP_RUNS).read_text())
@@ -111,6 +112,9 @@ def test_a_population_that_another_version_described_is_refused(tmp_path):
     (group.folder / GROUP_RUNS).write_text(json.dumps(described))
     with pytest.raises(SweepError, match=rf"{GROUP_RUNS}: holds a run of another version of sb3-cgp .*'tuned'"):
         Group.read(group.folder)
+    # A study of the same name, begun anew
+    forget_ended(ledger, tmp_path)
+    assert (group.folder / GROUP_RUNS).exists()
 
 
 def test_an_entry_that_is_edited_in_between_is_refused(tmp_path, monkeypatch):

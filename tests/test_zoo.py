@@ -246,6 +246,8 @@ def test_trials_of_optuna_save_no_states(path, tmp_path, monkeypatch):
     ("specified", "left"),
     [
         (None, []),
+        ("", []),
+        ({}, []),
         ("sb3_cgp.TrainingCheckpointCallback", []),
         ({"sb3_cgp.resumption.callbacks.TrainingCheckpointCallback": {"save_freq": 10}}, []),
         ("sb3_cgp.hparams.HParamsCallback", ["sb3_cgp.hparams.HParamsCallback"]),

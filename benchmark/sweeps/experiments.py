@@ -212,8 +212,9 @@ def experiments_in_words() -> str:
             match read_yaml(path):
                 case {"title": title, "includes": list(names)}:
                     lines.append(f"  {path.stem:<14} {title} = {', '.join(map(str, names))}")
-                case {"title": title, "steps": int(steps)}:
-                    lines.append(f"  {path.stem:<14} {title}, {steps:,} steps")
+                # YAML reads 1.0e+6 as a float
+                case {"title": title, "steps": int(steps) | float(steps)}:
+                    lines.append(f"  {path.stem:<14} {title}, {steps:,.0f} steps")
     return "\n".join(lines)
 
 

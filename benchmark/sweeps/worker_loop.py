@@ -23,6 +23,7 @@ from benchmark.sweeps.runs import Run
 from benchmark.sweeps.signals import TERMINATED, end_if_asked, undisturbed
 from benchmark.sweeps.studies import Ledger
 from benchmark.sweeps.study_trials import PROCESSORS, Claim, owned, run_of
+from benchmark.sweeps.validation import SweepError
 from sb3_cgp.resumption.store import StateStore
 
 
@@ -138,7 +139,11 @@ def forget_ended(ledger: Ledger, logs: Path) -> None:
     """
     ended = [run_of(trial) for trial in owned(ledger.trials()).values() if trial.state.is_finished()]
     for path in (logs / ledger.name / FOLDER).glob(f"*/{GROUP_RUNS}"):
-        group = Group.read(path.parent)
+        try:
+            group = Group.read(path.parent)
+        except SweepError:
+            # Of another version's study of this name
+            continue
         if all(run in ended for run in group.runs):
             _forget(group, [])
     for run in ended:

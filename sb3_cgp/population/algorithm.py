@@ -2,6 +2,7 @@
 
 import io
 import pathlib
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
@@ -187,8 +188,11 @@ class Population(ResumableAlgorithm, PopulationMembers):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
         # `set_env` may have changed it
         self._check_env()
-        # The user may have set another selector on the policy
-        self[0]._check_selector()
+        # The user may have set another selector on the policy. To make an agent repeats the constructor's warnings.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            agent = self[0]
+        agent._check_selector()
         return super()._setup_learn(*args, **kwargs)
 
     def _check_env(self) -> None:

@@ -22,8 +22,9 @@ class ChunkedSubprocVecEnv(SubprocVecEnv):
 
     SB3's ``SubprocVecEnv`` has one process for each environment: with more of them than cores, most of a step is spent in
     switching between processes and in one message for each environment. This one sends a message for each process. What it
-    returns is identical to what a ``DummyVecEnv`` of the same environments returns. It is a ``SubprocVecEnv``, so that dead
-    processes and saved states are handled as for any other.
+    returns is identical to what a ``DummyVecEnv`` of the same environments returns, but observations that NumPy would round or
+    broadcast to their space end the process with an error. It is a ``SubprocVecEnv``, so that dead processes and saved states
+    are handled as for any other.
 
     :param env_fns: functions that make the environments
     :param n_processes: number of processes, at most as many as environments; None for one for each available core

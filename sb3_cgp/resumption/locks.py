@@ -13,8 +13,10 @@ from filelock import FileLock, Timeout
 LOCK_FILE = ".lock"
 # Of a file of its own, as some versions of filelock truncate the file that they lock
 OWNER_SUFFIX = "-owner"
-# Errors of a file system without locks
-NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
+# Errors of a file system without locks, of which Linux has one (ENOTSUPP) that Python does not name
+NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL, 524)
+# Errors of a lock's file that another user has left
+NOT_OURS = (errno.EACCES, errno.EPERM)
 
 
 class FolderInUseError(RuntimeError):
@@ -48,7 +50,8 @@ class FolderLock:
         """
         Acquire the lock, without waiting for it.
 
-        A folder that cannot be written to needs no lock. On a file system without locks, a warning is given.
+        A folder that cannot be written to needs no lock. On a file system without locks, or where the lock's file is another
+        user's, a warning is given.
 
         :raises FolderInUseError: if another training holds it, naming its host and process
         :raises OSError: if it cannot be locked for another reason, such as too many open files
@@ -84,7 +87,7 @@ class FolderLock:
             # What else prevents writing to the folder is said where a state is written
             if not (self.folder.is_dir() and os.access(self.folder, os.W_OK)):
                 return
-            if error.errno not in NO_LOCKS:
+            if error.errno not in (*NO_LOCKS, *NOT_OURS):
                 raise
             warnings.warn(
                 f"The folder {self.folder} cannot be locked ({error}): make sure that no other process uses it.",

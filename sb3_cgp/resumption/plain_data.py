@@ -172,9 +172,9 @@ def equal(plain: Any, other: Any) -> bool:
     if isinstance(plain, np.ndarray):
         return plain.dtype == other.dtype and np.array_equal(plain, other, equal_nan=plain.dtype.kind in "fc")
     if isinstance(plain, dict):
-        if plain.get(TYPE) == other.get(TYPE) in UNORDERED:
-            # Each process has an order of its own for strings
-            return bool(from_plain(plain) == from_plain(other))
+        # Each process has an order of its own for strings
+        if plain.get(TYPE) == other.get(TYPE) in UNORDERED and from_plain(plain) == from_plain(other):
+            return True
         return plain.keys() == other.keys() and all(equal(value, other[key]) for key, value in plain.items())
     if isinstance(plain, list | tuple):
         return len(plain) == len(other) and all(map(equal, plain, other))

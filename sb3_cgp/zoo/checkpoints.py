@@ -39,7 +39,7 @@ def without_checkpoints(specified: Any) -> list[Any]:
     """
     from rl_zoo3.utils import get_class_by_name
 
-    entries = specified if isinstance(specified, list) else [] if specified is None else [specified]
+    entries = specified if isinstance(specified, list) else [specified] if specified else []
     names = [next(iter(entry)) if isinstance(entry, dict) else entry for entry in entries]
     kinds = [get_class_by_name(name) if isinstance(name, str) else type(name) for name in names]
     return [entry for entry, kind in zip(entries, kinds, strict=True) if not issubclass(kind, TrainingCheckpointCallback)]
