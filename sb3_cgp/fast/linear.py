@@ -8,6 +8,8 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_cgp.common.networks import is_hooked
+
 # Number of multiplications from which on oneDNN is faster despite the cost of its call
 MANY_MULTIPLICATIONS = 2**24
 
@@ -61,17 +63,6 @@ def is_linear(module: nn.Module) -> TypeGuard[nn.Linear]:
     :return: whether it is
     """
     return type(module) is nn.Linear
-
-
-def is_hooked(module: nn.Module) -> bool:
-    """
-    Return whether a module has hooks, so that a call of it does more than its ``forward``.
-
-    :param module: the module
-    :return: whether it has hooks
-    """
-    # PyTorch has no public attribute for this
-    return bool(module._forward_hooks or module._forward_pre_hooks or module._backward_hooks or module._backward_pre_hooks)
 
 
 def leading_relu_layers(modules: Iterable[nn.Module]) -> list[nn.Linear]:

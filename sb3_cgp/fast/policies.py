@@ -1,15 +1,13 @@
 """CGP's policies with the fast scoring."""
 
 from contextlib import nullcontext
-from itertools import chain
 from typing import Any
 
 import torch as th
-from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_cgp.common.networks import evaluation_mode
+from sb3_cgp.common.networks import evaluation_mode, has_modes
 from sb3_cgp.common.rules import require_choice
 from sb3_cgp.core import policies as core_policies
 from sb3_cgp.core.cem import Score
@@ -70,12 +68,11 @@ class CGPPolicy(policies.CGPPolicy):
 
         :param mode: if true, set to training mode, else set to evaluation mode
         """
-        # SB3 sets the mode at every prediction, which visits every module. The user may have trained or exchanged a features
-        # extractor; the other modules, and flattening, have no modes that differ.
-        extractors = [network.features_extractor for network in (self.actor, self.critic)]
-        visited = [each.modules() for each in extractors if type(each) is not FlattenExtractor]
-        if any(module.training != mode for module in chain((self, self.actor, self.critic), *visited)):
+        # SB3 sets the mode at every prediction, which visits every module
+        networks = filter(has_modes, (self.actor, self.critic))
+        if any(module.training != mode for network in networks for module in network.modules()):
             super().set_training_mode(mode)
+        self.training = mode
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         if self.inference == "cem" and self.recorded_selection is not None:

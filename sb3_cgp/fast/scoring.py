@@ -12,9 +12,10 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_cgp.common.networks import is_hooked
 from sb3_cgp.core.cem import Score
 from sb3_cgp.core.policies import repeated_q_score
-from sb3_cgp.fast.linear import is_hooked, is_linear, leading_relu_layers, multiply
+from sb3_cgp.fast.linear import is_linear, leading_relu_layers, multiply
 
 SCORING_DTYPES = ("auto", "float32", "bfloat16")
 
