@@ -234,7 +234,8 @@ class CGP(
         :param total_timesteps: The total number of samples (env steps) to train on, an integer >= 0, or an equal float
             such as 1e5
         :param callback: callback(s) called at every step with state of the algorithm.
-        :param log_interval: number of episodes between two writings of the log; None for no writing
+        :param log_interval: number of episodes between two writings of the log; None for no writing. The offline training of
+            the policy writes after each of its rounds in any case.
         :param tb_log_name: the name of the run for TensorBoard logging
         :param reset_num_timesteps: whether or not to reset the current timestep number (used in logging)
         :param progress_bar: Display a progress bar using tqdm and rich.

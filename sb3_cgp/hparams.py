@@ -27,8 +27,8 @@ def hyperparameters(model: BaseAlgorithm) -> dict[str, str | float]:
     """
     # Of an algorithm whose constructor takes further arguments that are none of its bases'
     declared = getattr(type(model), "hyperparameter_names", None)
+    names = set(constructor_argument_names(type(model)) if declared is None else declared) - _LEFT_OUT
     # An argument that the algorithm does not keep as an attribute cannot be read
-    names = set(declared or constructor_argument_names(type(model))) - _LEFT_OUT
     values = {name: getattr(model, name) for name in sorted(names) if hasattr(model, name)}
     values |= {"algorithm": type(model), "policy": model.policy_class, "n_envs": model.n_envs}
     # The learning rates in effect: SB3's schedule for every form of the argument, and the actor's own where there is one

@@ -15,6 +15,8 @@ CHANGES = {
     "loss": dict(policy_loss="qgp", policy_delay=2),
     "discount": dict(gamma=0.5),
     "returns": dict(n_steps=2),
+    "learning rate": dict(learning_rate=1e-4),
+    "learning rates": dict(learning_rate=2e-4, actor_learning_rate=2e-3),
 }
 
 
@@ -66,6 +68,18 @@ def test_the_policy_has_what_the_arguments_say():
     assert model.policy.inference == "cem"
 
 
+def test_a_learning_rate_is_that_of_the_next_gradient_step():
+    model = make_model().learn(60)
+    rates = lambda: [network.optimizer.param_groups[0]["lr"] for network in (model.critic, model.actor)]  # noqa: E731
+    assert rates() == [1e-3, 1e-3]
+    model.learning_rate = 1e-4
+    model.train(1, 16)
+    assert rates() == [1e-4, 1e-4]
+    model.actor_learning_rate = lambda remaining: 2e-4
+    model.train(1, 16)
+    assert rates() == [1e-4, 2e-4]
+
+
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
@@ -74,6 +88,8 @@ def test_the_policy_has_what_the_arguments_say():
         ("policy_delay", 0, "`policy_delay` is 0, but must be"),
         ("cem_dtype", "float64", "`cem_dtype` is 'float64', but must be"),
         ("cem_actor_fraction", 1.5, "`cem_actor_fraction` is 1.5, but must be"),
+        ("learning_rate", -1.0, "`learning_rate` is -1.0, but must be"),
+        ("actor_learning_rate", "fast", "`actor_learning_rate` is 'fast', but must be"),
         ("inference", "critic", "`inference` is 'critic', but must be"),
     ],
 )

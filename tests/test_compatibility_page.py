@@ -55,7 +55,7 @@ def test_a_page_has_returns_successes_and_what_was_noticed(monkeypatch):
         "- A note.",
         "Tested on A processor, 2 cores, with Python 3.11.7. Versions are those of `constraints.txt`, unless the package's "
         "section says otherwise.",
-        "The machine also ran other programs, so that steps/s may be too low, for works.",
+        "The machine also ran other programs: steps/s may be too low for works.",
         "- Two trainings with one seed differ: the environment does not repeat itself.",
     ):
         assert line in text.splitlines()

@@ -49,6 +49,7 @@ REFUSED = {
     "Discrete": (spaces.Discrete(5), 5, "value 5 at .* from 0 to 4"),
     "Discrete, negative": (spaces.Discrete(5), -1, "value -1 at"),
     "MultiDiscrete": (spaces.MultiDiscrete([3, 4]), np.array([2, 4]), "value 4 at .* from 0 to 3"),
+    "MultiDiscrete, scalar": (spaces.MultiDiscrete([3]), 5, r"value 5 at index \(0,\), .* from 0 to 2"),
     "MultiBinary": (spaces.MultiBinary(2), np.array([0, 2]), "value 2 at .* from 0 to 1"),
     "without a key": (PIXELS_BY_KEY, {"image": image(1)}, r"incomplete .*: \['image'\], .* the keys \['image', 'speed'\]"),
     "no dictionary": (PIXELS_BY_KEY, np.zeros(2), "incomplete .*: ndarray without keys"),

@@ -170,6 +170,13 @@ def test_arguments_that_a_subclass_passes_on_are_shown(derived, algorithm, furth
     assert ours == theirs | further | {"algorithm": derived.__name__}
 
 
+def test_a_subclass_may_show_no_arguments():
+    class Silent(CGP):
+        hyperparameter_names = ()
+
+    assert hyperparameters(Silent("MlpPolicy", "Pendulum-v1")).keys() == {"algorithm", "policy", "n_envs"}
+
+
 def test_a_population_shows_its_agents_and_no_attribute_of_sb3s():
     population = Population("MlpPolicy", "Pendulum-v1", [dict(gamma=0.5), dict(gamma=0.6)], **tiny())
     shown = hyperparameters(population)

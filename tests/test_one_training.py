@@ -5,6 +5,7 @@ import errno
 import gc
 import os
 import pickle
+import stat
 import subprocess
 import sys
 import textwrap
@@ -114,6 +115,15 @@ def test_a_lock_that_another_user_has_left_does_not_block(number, folder, monkey
     with pytest.warns(UserWarning, match=r"cannot be locked \(.*\.lock'\): make sure that no other process uses it"):
         model = CGP.resume(folder, env())
     assert model.learn(40).num_timesteps == 40
+
+
+def test_other_users_can_lock_the_same_file(tmp_path):
+    usual = os.umask(0o077)
+    try:
+        FolderLock(tmp_path).acquire()
+    finally:
+        os.umask(usual)
+    assert stat.S_IMODE((tmp_path / ".lock").stat().st_mode) == 0o666
 
 
 def test_a_folder_that_cannot_be_locked_for_another_reason_is_an_error(tmp_path, fail_to_lock):

@@ -47,6 +47,8 @@ def test_the_name_of_an_environment_stands_for_one_of_each_agent(tmp_path):
     # Each agent's environment has the agent's seed
     first = make(3, env="Pendulum-v1").learn(3).replay_buffer.observations[0]
     np.testing.assert_array_equal(loaded[0].replay_buffer.observations[0], first)
+    with pytest.raises(ValueError, match=r"`env.num_envs` is 2, but must be 3, as many as agents"):
+        population.set_env(make_vec_env("Pendulum-v1", 2))
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         Population.load(saved[0], env="MountainCarContinuous-v0")
 

@@ -137,7 +137,7 @@ SCHEDULES = {
 def test_a_schedule_that_is_set_on_the_model_and_will_be_lost_is_warned_of(name, tmp_path):
     algorithm, schedule = SCHEDULES[name]
     model = make_model(algorithm, env="CartPole-v1" if algorithm is not CGP else "Pendulum-v1")
-    message = rf"`model.{name}` is not what .*`\w+` make it.*: set these on the model, too"
+    message = rf"`model.{name}` and `.*` disagree.*: set both alike on the model"
     with pytest.warns(UserWarning, match=message):
         model.learn(90, [TrainingCheckpointCallback(20, tmp_path / "state"), Do(50, lambda: setattr(model, name, schedule))])
     with pytest.warns(UserWarning, match=message):
@@ -159,12 +159,24 @@ def test_a_learning_rate_in_each_form_is_saved_without_a_warning(rate, tmp_path)
     make_model(CGP, learning_rate=rate).save(tmp_path / "model")
 
 
-def test_a_learning_rate_that_is_set_with_its_schedule_is_resumed(tmp_path):
-    """By SB3's private method."""
+@pytest.mark.filterwarnings("error")
+def test_saving_calls_no_schedule_of_the_users(tmp_path):
+    calls = []
 
+    def decaying(remaining):
+        calls.append(remaining)
+        return 1e-3 * 0.99 ** len(calls)
+
+    for algorithm in (CGP, resumable(TD3)):
+        model = make_model(algorithm, learning_rate=decaying).learn(30)
+        n_calls = len(calls)
+        model.save(tmp_path / "model")
+        assert len(calls) == n_calls
+
+
+def test_a_learning_rate_that_is_set_is_resumed(tmp_path):
     def slow_down(model):
         model.learning_rate = 1e-5
-        model._setup_lr_schedule()
 
     straight = make_model(CGP)
     straight.learn(90, Do(30, lambda: slow_down(straight)))

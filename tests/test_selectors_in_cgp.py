@@ -12,6 +12,7 @@ from scores import Seen
 from small_models import step_without_learning
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
+from trainings import parameters_equal
 
 import sb3_cgp.core.policies as core_policies
 from sb3_cgp import CEM, CGP, MlpPolicy, Selection, TrainingCheckpointCallback
@@ -181,6 +182,17 @@ def test_the_actor_proposes_in_evaluation_mode_and_keeps_its_mode():
     assert th.equal(model.actor.mu[0][1].running_mean, statistics)
     assert model.actor.training
     assert model.actor.mu[0].training
+
+
+def test_a_compiled_policy_learns_as_the_policy_does():
+    def train(change):
+        model = make_model(**LIGHT)
+        model.policy = change(model.policy)
+        model.cem_samples = 12
+        return model.learn(70)
+
+    compiled = train(lambda policy: th.compile(policy, backend="eager"))
+    assert parameters_equal(compiled, train(lambda policy: policy))
 
 
 def test_offline_the_prior_alone_serves_until_the_actor_is_trained(monkeypatch):

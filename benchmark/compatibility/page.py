@@ -182,7 +182,7 @@ def _conditions(records: Sequence[dict[str, Any]]) -> list[str]:
         f"{record['machine']['cpu']}, {record['machine']['cores']} cores, with Python {record['python']}" for record in tested
     )
     busy = [record["package"] for record in tested if (record.get("load_average") or 0) > record["machine"]["cores"]]
-    low = f"The machine also ran other programs, so that steps/s may be too low, for {', '.join(busy)}.\n" if busy else ""
+    low = f"The machine also ran other programs: steps/s may be too low for {', '.join(busy)}.\n" if busy else ""
     pins = "Versions are those of `constraints.txt`, unless the package's section says otherwise."
     return [f"Tested on {'; '.join(machines)}. {pins}\n{low}"]
 

@@ -32,8 +32,7 @@ def check_shape(name: str, values: Any, space: spaces.Space, n_envs: int | None,
             )
         part, which = _part(values, name, key)
         shape, expected = np.shape(part), (*batch, *(subspace.shape or ()))
-        # NumPy may drop leading axes of length 1, or add them: no number is lost or repeated
-        if shape != expected and _without_leading_ones(shape) != _without_leading_ones(expected):
+        if shape != expected and not _can_be_collected(shape, expected):
             raise wrong_shape(which, shape, expected, timestep)
 
 
@@ -76,6 +75,19 @@ def _at(timestep: int | None) -> str:
     return "" if timestep is None else f" at environment step {timestep}"
 
 
+def _can_be_collected(shape: tuple[int, ...], expected: tuple[int, ...]) -> bool:
+    """Return whether NumPy assigns an array of one shape to one of another, and neither loses nor repeats a number."""
+    # NumPy may drop leading axes of length 1, or add them
+    if _without_leading_ones(shape) != _without_leading_ones(expected):
+        return False
+    try:
+        np.zeros((1, *expected))[0] = np.zeros(shape)
+    except (TypeError, ValueError):
+        # From version 2.4 on, an array of one element is no number
+        return False
+    return True
+
+
 def _without_leading_ones(shape: tuple[int, ...]) -> tuple[int, ...]:
     n_ones = next((index for index, length in enumerate(shape) if length != 1), len(shape))
     return shape[n_ones:]
@@ -93,9 +105,10 @@ def _check_range(name: str, values: np.ndarray, space: spaces.Space, timestep: i
             fits = (values >= low) & (values <= high) & (values % 1 == 0)
     if not fits.all():
         index = tuple(np.argwhere(~fits)[0].tolist())
-        highest = np.broadcast_to(high, values.shape)[index]
+        # A scalar may stand for an array of one element
+        value, highest = (each[index] for each in np.broadcast_arrays(values, high))
         raise ValueError(
-            f"The {name} that the environment returned{_at(timestep)} has the value {values[index]} at index "
+            f"The {name} that the environment returned{_at(timestep)} has the value {value} at index "
             f"{index}, where its space, {space}, has integers from {low} to {highest}. It was "
             "not stored. Correct the environment's `observation_space`; a wrapper that changes observations, such as one that "
             "scales images to [0, 1], has to set its own."

@@ -201,11 +201,13 @@ class Population(ResumableAlgorithm, PopulationMembers):
 
         :raises ValueError: if there are more or fewer than agents, or they share the statistics of ``VecNormalize``
         """
-        allowed = f"{len(self)}, as many as agents: environment i is agent i's"
-        n_envs = len(self) if self.env is None else self.env.num_envs
-        require(n_envs == len(self), "env.num_envs", n_envs, allowed)
+        if self.env is not None:
+            self._check_n_envs(self.env.num_envs)
         allowed = "without VecNormalize, whose statistics all agents would share"
         require(self._vec_normalize_env is None, "env", self.env, allowed)
+
+    def _check_n_envs(self, n_envs: int) -> None:
+        require(n_envs == len(self), "env.num_envs", n_envs, f"{len(self)}, as many as agents: environment i is agent i's")
 
     @suggests_names
     def learn(
@@ -287,8 +289,12 @@ class Population(ResumableAlgorithm, PopulationMembers):
 
         :param env: the environments, one for each agent, or the name of an environment, which is made once for each agent
         :param force_reset: see SB3's method
+        :raises ValueError: if there are more or fewer environments than agents
         """
-        super().set_env(make_agents_env(env, len(self)), force_reset)
+        envs = make_agents_env(env, len(self))
+        # Before SB3, whose error advises to load the population with them
+        self._check_n_envs(getattr(envs, "num_envs", 1))
+        super().set_env(envs, force_reset)
 
     def _excluded_save_params(self) -> list[str]:
         made = ["_schedules", "_numbers", "_counts", "_recorded", "_unlogged"]

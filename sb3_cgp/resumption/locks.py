@@ -37,8 +37,8 @@ class FolderLock:
         self.folder = folder
         self._owner_file = folder / f"{name}{OWNER_SUFFIX}"
         # A model may be deleted in another thread than the one that it was resumed in. On a file system without locks, a file
-        # alone would be in the way of a resumption after a kill, and of a copied folder.
-        self._lock = FileLock(folder / name, thread_local=False, fallback_to_soft=False)
+        # alone would be in the way of a resumption after a kill, and of a copied folder. Other users lock the same file.
+        self._lock = FileLock(folder / name, mode=0o666, thread_local=False, fallback_to_soft=False)
         self._process = os.getpid()
 
     @property

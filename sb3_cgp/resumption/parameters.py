@@ -57,12 +57,20 @@ def warn_of_lost_schedules(model: ResumableModel) -> None:
         if schedule is None:
             continue
         made = make(model)
-        if any(schedule(remaining) != made(remaining) for remaining in REMAINING):
+        # The user's own function is not called without need: it may count its calls
+        is_same = _function_of(schedule) is _function_of(made)
+        if not is_same and any(schedule(remaining) != made(remaining) for remaining in REMAINING):
             warnings.warn(
-                f"`model.{name}` is not what {arguments} make it, of which a model that is loaded or resumed makes it: set "
-                "these on the model, too. A learning rate may be a function of the progress remaining, from 1 to 0.",
+                f"`model.{name}` and {arguments} disagree. The model trains by the former; once it is loaded or resumed, it "
+                "trains by the latter: set both alike on the model. A learning rate may be a function of the progress "
+                "remaining, from 1 to 0.",
                 stacklevel=3,
             )
+
+
+def _function_of(schedule: Callable[[float], float]) -> Callable[[float], float]:
+    """Return the function of which SB3 has made a schedule, or the schedule itself."""
+    return getattr(schedule, "value_schedule", schedule)
 
 
 def check_optimizers(model: ResumableModel) -> None:

@@ -107,7 +107,8 @@ class SelectorAlgorithm(ChangeableAlgorithm):
         is_selector = not isinstance(selector, type) and callable(getattr(selector, "select", None))
         require(is_selector, "selector", selector, "an instance with a method `select`, such as sb3_cgp.selectors.MPPI()")
         allowed = "a subclass of sb3_cgp.CGPPolicy, whose actor can propose actions to the selector"
-        proposes = isinstance(self.policy, CGPPolicy)
+        # `torch.compile` returns a policy of a class of its own
+        proposes = issubclass(self.policy_class, CGPPolicy)
         require(proposes or not takes_proposals(selector), "policy", self.policy_class, allowed)
         if self.policy_loss is None:
             require(self.cem_start == "prior", "cem_start", self.cem_start, "'prior' where `policy_loss=None` trains no actor")

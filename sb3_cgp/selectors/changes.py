@@ -17,6 +17,7 @@ class ChangeableAlgorithm(CGP):
         **dict.fromkeys(("policy_loss", "policy_training", "policy_delay")),
         **dict.fromkeys(("target_update_interval", "target_policy_noise", "target_noise_clip")),
         "inference": "_choose_inference",
+        **dict.fromkeys(("learning_rate", "actor_learning_rate"), "_setup_lr_schedule"),
     }
 
     def __setattr__(self, name: str, value: Any) -> None:
