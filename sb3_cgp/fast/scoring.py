@@ -121,7 +121,7 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
     state_part, action_weight = _split(first, features)
     # The first of them multiplies negated differences
     weights = [-hidden[0].weight.to(dtype), *(layer.weight.to(dtype) for layer in hidden[1:])]
-    first_weight = action_weight.to(dtype).expand(features.shape[0], -1, -1)
+    first_weight = action_weight.to(dtype)
     width = max(layer.out_features for layer in (first, *hidden))
 
     def score(actions: th.Tensor) -> th.Tensor:
@@ -133,26 +133,25 @@ def _score_by_differences(q_network: nn.Sequential, features: th.Tensor, dtype: 
             common.append(multiply(activations[-1], layer.weight, layer.bias))
         # The last hidden layer in fewer passes: relu(u + d) = u + max(d, -u)
         common_values = F.linear(common[-1], last.weight, last.bias)
-        # The first hidden layer negated, min(-d - min(u, 0), relu(u)), whose first part is one product
-        different_actions = F.pad((common_actions - actions).to(dtype), (0, 1), value=1.0)  # (B, N, A + 1)
+        # The first hidden layer negated: min(-d - min(u, 0), relu(u))
+        different_actions = (common_actions - actions).to(dtype)
         first_offsets = (activations[0] - common[0]).to(dtype).unsqueeze(1)
-        first_weights = th.cat([first_weight, first_offsets], dim=1)  # (B, A + 1, H)
         upper_bounds = activations[0].abs().to(dtype).unsqueeze(1)
         offsets = [values.clamp(max=0.0).unsqueeze(1) for values in common[1:-1]]
         lower_bounds = [values.neg().unsqueeze(1) for values in (*activations[1:], common[-1])]
 
         def score_block(
-            block_actions: th.Tensor, block_weights: th.Tensor, block_upper_bounds: th.Tensor, *of_states: th.Tensor
+            block_actions: th.Tensor, addends: th.Tensor, block_upper_bounds: th.Tensor, *of_states: th.Tensor
         ) -> th.Tensor:
             block_offsets, block_lower_bounds = of_states[: len(offsets)], of_states[len(offsets) :]
-            rounded = _clip_above(th.bmm(block_actions, block_weights), block_upper_bounds).flatten(0, 1)
+            rounded = _clip_above(_multiply_each(block_actions, first_weight, addends), block_upper_bounds)
             different = multiply(rounded, weights[0]).to(actions.dtype)
             for weight, block_offset, block_lower_bound in zip(weights[1:], block_offsets, block_lower_bounds, strict=False):
                 different.unflatten(0, block_actions.shape[:2]).add_(block_offset)
                 different = multiply(_clip_below(different, block_lower_bound).to(dtype), weight).to(actions.dtype)
             return th.mv(_clip_below(different, block_lower_bounds[-1]), last.weight[0])
 
-        values = _in_blocks(score_block, width, different_actions, first_weights, upper_bounds, *offsets, *lower_bounds)
+        values = _in_blocks(score_block, width, different_actions, first_offsets, upper_bounds, *offsets, *lower_bounds)
         return values.add_(common_values)
 
     return score
@@ -206,13 +205,13 @@ def _clip_below(hidden: th.Tensor, lower_bounds: th.Tensor) -> th.Tensor:
 
 def _clip_above(hidden: th.Tensor, upper_bounds: th.Tensor) -> th.Tensor:
     """
-    Clip activations of 16 bits, (b, N, H), at non-negative upper bounds, (b, 1, H), in place.
+    Clip 16-bit activations of each state's actions, (b N, H), at the state's non-negative upper bounds, (b, 1, H), in place.
 
     The numbers are compared as integers, five times as fast as bfloat16, which saves 5 % of a CEM call. Both orders agree
     unless both numbers are negative. So no upper bound may have its sign bit set, not even a negative zero.
     """
-    integers = hidden.view(th.int16)
-    th.minimum(integers, upper_bounds.view(th.int16), out=integers)
+    by_state = hidden.view(th.int16).unflatten(0, (upper_bounds.shape[0], -1))
+    th.minimum(by_state, upper_bounds.view(th.int16), out=by_state)
     return hidden
 
 
