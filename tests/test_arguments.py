@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch as th
 from gymnasium import spaces
 from small_models import make_model
 from stable_baselines3 import TD3, HerReplayBuffer
@@ -96,18 +95,6 @@ def test_schedules_are_tried_from_the_beginning_to_the_end(name):
         make_model(**{name: lambda remaining: 1e-3 / remaining})
     with pytest.raises(ValueError, match=rf"`{name}` is .* must be a schedule .*; at 0.0 it raises IndexError"):
         make_model(**{name: lambda remaining: [1e-3, 1e-4][int((1 - remaining) * 2)]})
-
-
-@pytest.mark.parametrize("rate", [1e-3, np.float32(1e-3), np.array(1e-3), th.tensor(1e-3), th.tensor([1e-3])], ids=repr)
-def test_a_schedule_may_return_what_sb3_converts(rate):
-    model = make_model(learning_rate=lambda remaining: rate)
-    assert model.lr_schedule(1.0) == pytest.approx(1e-3)
-
-
-@pytest.mark.parametrize("rate", [np.zeros(2), None, "fast"], ids=str)
-def test_a_schedule_of_something_else_is_refused(rate):
-    with pytest.raises(ValueError, match=r"`learning_rate` is .* must be a schedule .*; at 1.0 it raises"):
-        make_model(learning_rate=lambda remaining: rate)
 
 
 def test_noise_of_several_environments_is_checked_too():

@@ -14,9 +14,7 @@ from torch import nn
 
 from sb3_cgp import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_cgp.common.networks import MODELESS, evaluation_mode, has_modes, update_average
-from sb3_cgp.core.losses import cgp_loss
 
-LIGHT = dict(cem_start="actor", cem_iterations=1, cem_samples=16)
 IMAGE = spaces.Box(0, 255, (3, 36, 36), np.uint8)
 VECTOR = spaces.Box(-1, 1, (4,))
 # How to make each kind of module, and its inputs
@@ -116,40 +114,3 @@ def test_averages_move_and_statistics_are_copied():
         assert th.allclose(average[0].weight, expected)
         for name, statistic in average.named_buffers():
             assert th.equal(statistic, network.get_buffer(name)) == name.startswith("1.running_")
-
-
-def count_forward_passes(monkeypatch):
-    passes, forward = [], Actor.forward
-
-    def counted(self, observations):
-        passes.append(self)
-        return forward(self, observations)
-
-    monkeypatch.setattr(Actor, "forward", counted)
-    return passes
-
-
-def test_the_loss_computes_the_actors_actions_once(monkeypatch):
-    model = make_model(**LIGHT).learn(60)
-    observations = th.rand(8, 3)
-    th.manual_seed(0)
-    actions = model.actor(observations)
-    expected = (actions - model.policy.select_actions(observations, model.critic).actions).square().mean()
-    passes = count_forward_passes(monkeypatch)
-    th.manual_seed(0)
-    assert th.equal(cgp_loss(model.policy, observations), expected)
-    assert passes == [model.actor]
-
-
-def test_an_actor_with_modes_proposes_other_actions_than_its_loss_sees(monkeypatch):
-    model = make_model(**LIGHT).learn(60)
-    model.actor.mu = nn.Sequential(nn.Dropout(0.5), *model.actor.mu)
-    model.policy.set_training_mode(True)
-    given, select = [], model.policy.selector.select
-    monkeypatch.setattr(model.policy.selector, "select", lambda *a, **k: (given.append(k["proposals"]), select(*a, **k))[1])
-    passes = count_forward_passes(monkeypatch)
-    observations = th.rand(8, 3)
-    cgp_loss(model.policy, observations)
-    assert passes == [model.actor] * 2
-    model.policy.set_training_mode(False)
-    assert th.equal(given[0][:, 0], model.actor(observations))

@@ -37,35 +37,46 @@ def has_modes(network: nn.Module) -> bool:
     To find that it does not takes a fraction of the time of setting the mode, which visits all modules as well.
 
     :param network: the network
-    :return: False if all of its modules are known to compute the same in both modes, and have no hooks
+    :return: False if all of its modules are known to compute the same in both modes, and neither have hooks, buffers nor a
+        ``forward`` of their own
     """
     modules = [network]
     for module in modules:
-        if type(module) not in MODELESS or is_hooked(module):
+        if type(module) not in MODELESS or is_hooked(module) or module._buffers or "forward" in vars(module):
             return True
         # `Module.children` and `Module.modules` take several times as long
         modules.extend(module._modules.values())  # type: ignore[arg-type]
     return False
 
 
+def set_mode(network: nn.Module, is_training: bool) -> None:
+    """
+    Put a network into training or evaluation mode, and its submodules, too, if that makes a difference.
+
+    :param network: the network
+    :param is_training: whether into training mode
+    """
+    if not has_modes(network):
+        network.training = is_training
+    elif any(module.training != is_training for module in network.modules()):
+        network.train(is_training)
+
+
 @contextmanager
 def evaluation_mode(network: nn.Module) -> Iterator[None]:
     """
-    Put a network into evaluation mode within a ``with`` block, if that makes a difference.
+    Put a network into evaluation mode within a ``with`` block.
 
     Neither dropout nor batch statistics disturb it then, and its running statistics do not change.
 
     :param network: the network. A submodule that alone was in training mode is left in evaluation mode.
     """
     was_training = network.training
-    is_changed = has_modes(network)
-    if is_changed and any(module.training for module in network.modules()):
-        network.eval()
+    set_mode(network, False)
     try:
         yield
     finally:
-        if is_changed and was_training:
-            network.train()
+        set_mode(network, was_training)
 
 
 def update_average(network: nn.Module, average: nn.Module, tau: float) -> None:

@@ -5,6 +5,7 @@ import math
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import VectorizedActionNoise
@@ -76,12 +77,13 @@ def check_learning_rate(name: str, value: Any) -> None:
         # The last gradient step of a training often has no progress remaining
         for progress_remaining in (1.0, 0.5, 0.0):
             try:
-                # As SB3 does, which takes all that can be converted, such as a tensor of one number
-                rate = float(value(progress_remaining))
+                rate = value(progress_remaining)
             except Exception as error:
                 allowed = f"a schedule of numbers from 1.0 to 0.0; at {progress_remaining} it raises {error!r}"
                 require(False, name, value, allowed)
-            require_number(f"{name}({progress_remaining})", rate)
+            # As SB3 does, which takes an array or a tensor of one number too
+            is_single = isinstance(rate, np.ndarray | th.Tensor) and math.prod(rate.shape) == 1
+            require_number(f"{name}({progress_remaining})", rate.item() if is_single else rate)
     else:
         require_number(name, value)
 

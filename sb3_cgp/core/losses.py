@@ -15,8 +15,7 @@ from sb3_cgp.core.policies import CGPPolicy
 
 def cgp_loss(policy: CGPPolicy, observations: PyTorchObs) -> th.Tensor:
     """Return the mean squared error between the actor's actions and CEM's, ``(π(s) - π_CEM(s))²`` ("CGP loss")."""
-    actions = policy.actor(observations)
-    return F.mse_loss(actions, policy.select_actions(observations, policy.critic, actions.detach()).actions)
+    return F.mse_loss(policy.actor(observations), policy.select_actions(observations, policy.critic).actions)
 
 
 def qgp_loss(policy: CGPPolicy, observations: PyTorchObs) -> th.Tensor:

@@ -65,7 +65,6 @@ class CGPPolicy(TD3Policy):
     ):
         require_choice("inference", inference, ("actor", "averaged_actor", "cem"))
         super().__init__(observation_space, action_space, lr_schedule, [256, 256] if net_arch is None else net_arch, **kwargs)
-        self.action_dim = get_action_dim(action_space)
         self.selector = selector
         self.inference = inference
 
@@ -77,9 +76,7 @@ class CGPPolicy(TD3Policy):
         return repeated_q_score(q_network, features)
 
     @th.no_grad()
-    def select_actions(
-        self, observation: PyTorchObs, critic: ContinuousCritic, actor_actions: th.Tensor | None = None
-    ) -> Selection:
+    def select_actions(self, observation: PyTorchObs, critic: ContinuousCritic) -> Selection:
         """
         Select the actions that the first network of a critic rates highest (π_CEM of Algorithm 1).
 
@@ -87,8 +84,6 @@ class CGPPolicy(TD3Policy):
 
         :param observation: a batch of B observations, as tensors
         :param critic: the critic, or the target critic
-        :param actor_actions: the actor's actions for the observations, (B, A), if they are known. The paper's CEM has no use
-            for them; subclasses may.
         :return: the selected actions, (B, A), in the scaled action space, and the elites
         :raises ValueError: if the policy has no selector, as where it was made without an algorithm
         """
@@ -98,12 +93,10 @@ class CGPPolicy(TD3Policy):
         with evaluation_mode(critic):
             features = critic.extract_features(observation, critic.features_extractor)
             score = self.make_score(critic.q_networks[0], features)
-            arguments = self.selector_arguments(observation, critic, actor_actions)
-            return selector.select(score, features.shape[0], self.action_dim, features.device, **arguments)
+            sizes = features.shape[0], get_action_dim(self.action_space)
+            return selector.select(score, *sizes, features.device, **self.selector_arguments(observation, critic))
 
-    def selector_arguments(
-        self, observation: PyTorchObs, critic: ContinuousCritic, actor_actions: th.Tensor | None
-    ) -> dict[str, Any]:
+    def selector_arguments(self, observation: PyTorchObs, critic: ContinuousCritic) -> dict[str, Any]:
         """Return further arguments of the selector's ``select``, of which the paper has none; subclasses override this."""
         return {}
 

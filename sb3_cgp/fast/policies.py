@@ -7,7 +7,7 @@ import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_cgp.common.networks import evaluation_mode, has_modes
+from sb3_cgp.common.networks import evaluation_mode, set_mode
 from sb3_cgp.common.rules import require_choice
 from sb3_cgp.core import policies as core_policies
 from sb3_cgp.core.cem import Score
@@ -69,9 +69,8 @@ class CGPPolicy(policies.CGPPolicy):
         :param mode: if true, set to training mode, else set to evaluation mode
         """
         # SB3 sets the mode at every prediction, which visits every module
-        networks = filter(has_modes, (self.actor, self.critic))
-        if any(module.training != mode for network in networks for module in network.modules()):
-            super().set_training_mode(mode)
+        for network in (self.actor, self.critic):
+            set_mode(network, mode)
         self.training = mode
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:

@@ -31,16 +31,20 @@ def check_contents(buffer: ReplayBuffer) -> None:
         if not is_float:
             continue
         is_scaled = name == "actions" and isinstance(buffer.action_space, spaces.Box)
-        limit = 1.0 + 1e-6 if is_scaled else np.inf
         for first in range(0, size, ROWS):
             rows: Any = array[first : min(first + ROWS, size)]
-            # The extremes of rows with NaN are NaN, and a comparison with NaN is false
-            if not (rows.min() > -limit and rows.max() < limit):
-                is_wrong = ~(abs(rows) < limit)
+            # The extremes of rows with NaN are NaN
+            if not (_is_right(rows.min(), is_scaled) and _is_right(rows.max(), is_scaled)):
+                is_wrong = ~_is_right(rows, is_scaled)
                 row = int(th.as_tensor(is_wrong).nonzero()[0][0])
                 allowed = SCALED if is_scaled else "finite: leave out the transition"
                 value = rows[is_wrong][0]
                 raise ValueError(f"The value in `replay_buffer.{name}[{first + row}]` is {value}, but must be {allowed}.")
+
+
+def _is_right(values: Any, is_scaled: bool) -> Any:
+    """Return whether numbers are finite, or those of scaled actions within [-1, 1]. A comparison with NaN is false."""
+    return abs(values) <= 1.0 + 1e-6 if is_scaled else abs(values) < np.inf
 
 
 def _arrays(buffer: ReplayBuffer) -> Iterator[tuple[str, np.ndarray | th.Tensor]]:

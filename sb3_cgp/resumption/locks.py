@@ -95,6 +95,8 @@ class FolderLock:
             )
             return
         with suppress(OSError):
+            # It may be another user's, of a process that was killed
+            self._owner_file.unlink(missing_ok=True)
             self._owner_file.write_text(f"process {os.getpid()} on host {socket.gethostname()}")
 
     def read_owner(self) -> str:

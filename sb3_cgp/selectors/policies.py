@@ -2,11 +2,10 @@
 
 from typing import Any
 
-import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_cgp.common.networks import evaluation_mode, has_modes
+from sb3_cgp.common.networks import evaluation_mode
 from sb3_cgp.common.rules import require
 from sb3_cgp.core import policies
 from sb3_cgp.selectors.actor_only import ActorOnly
@@ -31,16 +30,12 @@ class CGPPolicy(policies.CGPPolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | dict(actor_proposes=self.actor_proposes)
 
-    def selector_arguments(
-        self, observation: PyTorchObs, critic: ContinuousCritic, actor_actions: th.Tensor | None
-    ) -> dict[str, Any]:
+    def selector_arguments(self, observation: PyTorchObs, critic: ContinuousCritic) -> dict[str, Any]:
         """
         Return proposals for a selector that takes them: the averaged actor's action for the target critic, else the actor's.
 
         :param observation: a batch of B observations, as tensors
         :param critic: the critic, or the target critic
-        :param actor_actions: the actor's actions, (B, A), if they are known. They are computed again if the actor's mode makes
-            a difference, as they may stem from training mode.
         :return: ``proposals``, (B, 1, A), or None while no actor is trained; nothing for other selectors
         """
         if not takes_proposals(self.selector):
@@ -49,7 +44,5 @@ class CGPPolicy(policies.CGPPolicy):
         if not self.actor_proposes and not isinstance(self.selector, ActorOnly):
             return {"proposals": None}
         actor = self.actor_target if critic is self.critic_target else self.actor
-        if actor_actions is None or has_modes(actor):
-            with evaluation_mode(actor):
-                actor_actions = actor(observation)
-        return {"proposals": actor_actions.unsqueeze(1)}
+        with evaluation_mode(actor):
+            return {"proposals": actor(observation).unsqueeze(1)}
