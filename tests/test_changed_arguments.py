@@ -80,6 +80,13 @@ def test_a_learning_rate_is_that_of_the_next_gradient_step():
     assert rates() == [1e-4, 2e-4]
 
 
+def test_a_schedule_that_was_set_stays_when_the_actors_rate_changes():
+    model = make_model()
+    model.lr_schedule = lambda remaining: 5e-4
+    model.actor_learning_rate = 1e-4
+    assert (model.lr_schedule(1.0), model.actor_lr_schedule(1.0)) == (5e-4, 1e-4)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [

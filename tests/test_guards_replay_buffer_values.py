@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch as th
 from guarded import SMALL, GuardedTD3, located
+from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cgp import CGP
@@ -102,3 +104,14 @@ def test_a_buffer_on_the_models_device_is_checked_too(name, value, message):
     getattr(buffer, name)[4] = value
     with pytest.raises(ValueError, match=re.escape(message)):
         check_contents(buffer)
+
+
+def test_the_bounds_of_actions_are_right_in_every_precision():
+    for dtype in (np.float16, np.float32, np.float64):
+        buffer = ReplayBuffer(4, spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (1,), dtype))
+        for bound in (-1.0, 1.0):
+            buffer.add(np.zeros((1, 3)), np.zeros((1, 3)), np.full((1, 1), bound, dtype), np.zeros(1), np.zeros(1), [{}])
+        check_contents(buffer)
+        buffer.actions[1] = 1.01
+        with pytest.raises(ValueError, match="must be scaled"):
+            check_contents(buffer)

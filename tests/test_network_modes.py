@@ -34,6 +34,17 @@ class NoisyLinear(nn.Linear):
         return super().forward(inputs) + (th.randn(1) if self.training else 0)
 
 
+def buffered(linear):
+    linear.register_buffer("running_scale", th.ones(1))
+    return linear
+
+
+def patched(linear):
+    usual = linear.forward
+    linear.forward = lambda inputs: usual(inputs) * (2 if linear.training else 1)
+    return linear
+
+
 def hooked(linear):
     linear.register_forward_hook(lambda module, inputs, output: output * (2 if module.training else 1))
     return linear
@@ -65,6 +76,8 @@ def test_every_kind_without_modes_has_an_example():
         nn.RReLU(),
         NoisyLinear(2, 2),
         hooked(nn.Linear(2, 2)),
+        buffered(nn.Linear(2, 2)),
+        patched(nn.Linear(2, 2)),
         nn.utils.spectral_norm(nn.Linear(2, 2)),
         nn.utils.parametrizations.spectral_norm(nn.Linear(2, 2)),
     ],

@@ -76,7 +76,8 @@ def evaluation_mode(network: nn.Module) -> Iterator[None]:
     try:
         yield
     finally:
-        set_mode(network, was_training)
+        if was_training:
+            set_mode(network, True)
 
 
 def update_average(network: nn.Module, average: nn.Module, tau: float) -> None:

@@ -120,12 +120,11 @@ class CGP(OffPolicyAlgorithm):
 
     def _setup_lr_schedule(self) -> None:
         self.lr_schedule = as_schedule(self.learning_rate)
-        self._actor_lr_schedule = None if self.actor_learning_rate is None else as_schedule(self.actor_learning_rate)
 
     @property
     def actor_lr_schedule(self) -> Schedule:
         """The actor's learning rate as a function of the progress remaining: its own, or the critics'."""
-        return self._actor_lr_schedule or self.lr_schedule
+        return self.lr_schedule if self.actor_learning_rate is None else as_schedule(self.actor_learning_rate)
 
     def _setup_model(self) -> None:
         # Not in the constructor: `load` sets the saved arguments after it, and calls this method then
@@ -350,7 +349,7 @@ class CGP(OffPolicyAlgorithm):
         self._record_means({"actor_loss": losses})
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "actor_target", "critic", "critic_target", "_actor_lr_schedule"]
+        return [*super()._excluded_save_params(), "actor", "actor_target", "critic", "critic_target"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []

@@ -2,7 +2,6 @@
 
 from typing import Any, ClassVar
 
-from sb3_cgp.common.sb3_arguments import as_schedule
 from sb3_cgp.core.cgp import CGP
 
 
@@ -15,11 +14,10 @@ class ChangeableAlgorithm(CGP):
 
     # The arguments, each with the method that lets the policy follow its change; None where there is nothing more to do
     changeable_arguments: ClassVar[dict[str, str | None]] = {
-        **dict.fromkeys(("policy_loss", "policy_training", "policy_delay")),
+        **dict.fromkeys(("policy_loss", "policy_training", "policy_delay", "actor_learning_rate")),
         **dict.fromkeys(("target_update_interval", "target_policy_noise", "target_noise_clip")),
         "inference": "_choose_inference",
-        "learning_rate": "_follow_learning_rate",
-        "actor_learning_rate": "_follow_actor_learning_rate",
+        "learning_rate": "_setup_lr_schedule",
     }
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -49,9 +47,3 @@ class ChangeableAlgorithm(CGP):
         """Set an argument, and check it with the others; subclasses extend this."""
         super().__setattr__(name, value)
         self._check_arguments()
-
-    def _follow_learning_rate(self) -> None:
-        self.lr_schedule = as_schedule(self.learning_rate)
-
-    def _follow_actor_learning_rate(self) -> None:
-        self._actor_lr_schedule = None if self.actor_learning_rate is None else as_schedule(self.actor_learning_rate)
