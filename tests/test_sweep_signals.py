@@ -5,6 +5,7 @@ import weakref
 from functools import partial
 from types import SimpleNamespace
 
+import optuna
 import pytest
 from ledgers import trials_of
 from optuna.storages import InMemoryStorage
@@ -15,8 +16,9 @@ from trainings import SMALL, Do
 from tunings import arguments, tuner_of
 
 from benchmark import sweep, tune
-from benchmark.sweeps import execution, signals, tune_execution
+from benchmark.sweeps import execution, groups, signals, tune_execution
 from benchmark.sweeps import worker_loop as worker
+from benchmark.sweeps.heartbeats import TrialLostError
 from benchmark.sweeps.storages import open_storage
 from benchmark.sweeps.studies import Ledger
 from sb3_cgp import CGP
@@ -197,6 +199,67 @@ def once(method):
         return result
 
     return act
+
+
+CLAIMING = [(Ledger, "_take"), (Ledger, "annotate"), (groups.Groups, "claim"), (worker, "run_folder"), (worker, "ClaimedRuns")]
+
+
+@pytest.mark.parametrize(("owner", "name"), CLAIMING)
+def test_a_signal_while_runs_are_taken_gives_them_back(clock, tmp_path, monkeypatch, owner, name):
+    """Also where it comes between two writes to the study, or between the claim and the training."""
+    signals.handle_as_worker(1)
+    monkeypatch.setattr(owner, name, once(getattr(owner, name)))
+    trained = []
+    monkeypatch.setattr(worker, "train", lambda *args: trained.append(args))
+    storage = InMemoryStorage()
+    with pytest.raises(SystemExit, match="143"):
+        work_through(storage, make_sweep(["Good"]), clock, tmp_path)
+    assert trained == []
+    assert [trial.state for trial in trials_of(storage)] == [TrialState.FAIL, TrialState.WAITING, TrialState.WAITING]
+
+
+@pytest.mark.parametrize("error", [ValueError("the run's"), TrialLostError("the trial")])
+def test_a_signal_while_a_run_is_given_up_does_not_interrupt_that(clock, tmp_path, monkeypatch, error):
+    signals.handle_as_worker(1)
+
+    def fail(*args):
+        monkeypatch.setattr(Ledger, "_end", once(Ledger._end))
+        raise error
+
+    monkeypatch.setattr(worker, "train", fail)
+    storage = InMemoryStorage()
+    with pytest.raises(SystemExit, match="143"):
+        work_through(storage, make_sweep(["Good"]), clock, tmp_path)
+    trials = trials_of(storage)
+    failed = "error" in trials[0].user_attrs
+    assert failed == isinstance(error, ValueError)
+    assert [trial.state for trial in trials] == [TrialState.FAIL, TrialState.WAITING] + [TrialState.WAITING] * (not failed)
+
+
+def test_a_signal_while_a_configuration_is_taken_gives_it_back(work, pretend, monkeypatch):
+    signals.handle_as_worker(1)
+    storage = InMemoryStorage()
+    runs = pretend(lambda run: 1.0)
+    monkeypatch.setattr(optuna.Study, "ask", once(optuna.Study.ask))
+    with pytest.raises(SystemExit, match="143"):
+        work(storage=storage, trials=1, seeds=1)
+    assert runs == []
+    # Of a new configuration nothing had been sampled
+    assert [trial.state for trial in storage.get_all_trials(0)] == [TrialState.FAIL]
+
+
+def test_a_signal_does_not_lose_a_configuration_that_is_enqueued_again(monkeypatch):
+    signals.handle_as_worker(1)
+    storage = InMemoryStorage()
+    tuner = tuner_of(tune.parse(arguments()), storage)
+    trial = tuner._study.ask()
+    tuner._tuning.sample(trial)
+    monkeypatch.setattr(tuner._silence, "find", lambda trials: trials)
+    monkeypatch.setattr(storage, "set_trial_state_values", once(storage.set_trial_state_values))
+    tuner.recover()
+    assert [trial.state for trial in tuner.trials()] == [TrialState.FAIL, TrialState.WAITING]
+    with pytest.raises(SystemExit, match="143"):
+        signals.end_if_asked()
 
 
 def test_a_second_signal_does_not_interrupt_the_giving_back_of_a_run(clock, tmp_path, monkeypatch):

@@ -56,9 +56,13 @@ def handle_as_worker(parent: int | None) -> None:
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Ignore SIGTERM within a ``with`` block in which a process that ends gives its runs back."""
+    """
+    Only note SIGTERM within a ``with`` block that must not be left halfway, such as one that takes runs or gives them back.
+
+    The next call of :func:`end_if_asked` ends the process.
+    """
     is_main = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGTERM, signal.SIG_IGN) if is_main else None
+    handler = signal.signal(signal.SIGTERM, _note) if is_main else None
     try:
         yield
     finally:
@@ -76,10 +80,15 @@ def _is_ending() -> bool:
     return len(_noted) > 0 or StopSignals.is_asked()
 
 
+def _note(number: int, frame: FrameType | None) -> None:
+    if not _is_ending():
+        _noted.append(number)
+
+
 def _terminate(number: int, frame: FrameType | None) -> None:
     # A scheduler's signal reaches all processes of a job, and the parent's follows: the second one would interrupt the saving
     if not _is_ending():
-        _noted.append(number)
+        _note(number, frame)
         _end(number)
 
 

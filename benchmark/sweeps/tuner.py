@@ -23,7 +23,7 @@ from benchmark.sweeps.heartbeats import HeartbeatThread, SilenceDetector, TrialL
 from benchmark.sweeps.locks import locked
 from benchmark.sweeps.run import MACHINE_ERRORS, forget_states, run_folder, train
 from benchmark.sweeps.scoring import PRUNERS, SCORING
-from benchmark.sweeps.signals import undisturbed
+from benchmark.sweeps.signals import end_if_asked, undisturbed
 from benchmark.sweeps.study_trials import ERROR, LOST, OUTCOME, STOPPED, SWEEP, TUNING
 from benchmark.sweeps.tuning import ORIGIN, SCORES, Tuning
 from benchmark.sweeps.validation import SweepError
@@ -84,7 +84,8 @@ class Tuner:
         If this process dies between the two steps of that, a configuration is lost, and another is sampled in its place.
         """
         for trial in self._silence.find(self.trials()):
-            self._give_back(trial.number, LOST)
+            with undisturbed():
+                self._give_back(trial.number, LOST)
 
     def _give_back(self, number: int, outcome: str) -> None:
         trial_id = self._id(number)
@@ -120,7 +121,20 @@ class Tuner:
         :param parent: the process that started this one
         :param device: device of the networks
         """
-        trial = self._study.ask()
+        trial: optuna.Trial | None = None
+        try:
+            with undisturbed():
+                trial = self._study.ask()
+            end_if_asked()
+            self._train(trial, logs, interval, parent, device)
+        except BaseException as error:
+            # The process has to end
+            if trial is not None and not isinstance(error, Exception):
+                with undisturbed():
+                    self._give_back(trial.number, STOPPED)
+            raise
+
+    def _train(self, trial: optuna.Trial, logs: Path, interval: float, parent: int | None, device: str) -> None:
         trial_id = self._id(trial.number)
 
         def beat(count: str, step: int, *seconds: float) -> None:
@@ -143,11 +157,8 @@ class Tuner:
             raise
         except Exception as error:
             traceback.print_exc()
-            self._fail(trial_id, error)
-        except BaseException:
             with undisturbed():
-                self._give_back(trial.number, STOPPED)
-            raise
+                self._fail(trial_id, error)
 
     def _scores(
         self, trial: optuna.Trial, trial_id: int, logs: Path, heartbeat: HeartbeatThread, device: str

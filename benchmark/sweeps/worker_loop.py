@@ -52,17 +52,28 @@ def execute_runs(
     while True:
         end_if_asked()
         ledger.recover()
-        claims, group = groups.claim(ledger, name)
-        if claims:
-            _train_claimed(ledger, claims, group, logs, beat, parent, device)
-        elif not ledger.left():
+        claims: list[Claim] = []
+        try:
+            with undisturbed():
+                claims, group = groups.claim(ledger, name)
+            end_if_asked()
+            if claims:
+                _train_claimed(ledger, claims, group, logs, beat, parent, device)
+                continue
+        except BaseException as error:
+            # The process has to end. What has ended, or was given back, stays as it is.
+            if not isinstance(error, Exception):
+                with undisturbed():
+                    for claim in claims:
+                        ledger.release(claim)
+            raise
+        if not ledger.left():
             forget_ended(ledger, logs)
             return
-        else:
-            # Runs of other processes, or of lost ones whose grace period has not passed
-            time.sleep(PAUSE)
-            if parent is not None and os.getppid() != parent:
-                raise SystemExit(TERMINATED)
+        # Runs of other processes, or of lost ones whose grace period has not passed
+        time.sleep(PAUSE)
+        if parent is not None and os.getppid() != parent:
+            raise SystemExit(TERMINATED)
 
 
 def _train_claimed(
@@ -96,7 +107,8 @@ def _train_claimed(
                 _forget(group, folders)
         except TrialLostError:
             print(f"{_in_words(claims, group)} was given to another process", flush=True)
-            claimed.release()
+            with undisturbed():
+                claimed.release()
         except MACHINE_ERRORS as error:
             with undisturbed():
                 if claimed.is_stuck(error):
@@ -106,11 +118,8 @@ def _train_claimed(
             raise
         except Exception as error:
             traceback.print_exc()
-            _give_up(claimed, runs, group, folders, error)
-        except BaseException:
             with undisturbed():
-                claimed.release()
-            raise
+                _give_up(claimed, runs, group, folders, error)
 
 
 def _give_up(
