@@ -88,7 +88,7 @@ def _note(number: int, frame: FrameType | None) -> None:
 def _terminate(number: int, frame: FrameType | None) -> None:
     # A scheduler's signal reaches all processes of a job, and the parent's follows: the second one would interrupt the saving
     if not _is_ending():
-        _note(number, frame)
+        _noted.append(number)
         _end(number)
 
 

@@ -127,9 +127,8 @@ class Tuner:
                 trial = self._study.ask()
             end_if_asked()
             self._train(trial, logs, interval, parent, device)
-        except BaseException as error:
-            # The process has to end
-            if trial is not None and not isinstance(error, Exception):
+        except (SystemExit, KeyboardInterrupt):
+            if trial is not None:
                 with undisturbed():
                     self._give_back(trial.number, STOPPED)
             raise

@@ -60,12 +60,11 @@ def execute_runs(
             if claims:
                 _train_claimed(ledger, claims, group, logs, beat, parent, device)
                 continue
-        except BaseException as error:
-            # The process has to end. What has ended, or was given back, stays as it is.
-            if not isinstance(error, Exception):
-                with undisturbed():
-                    for claim in claims:
-                        ledger.release(claim)
+        except (SystemExit, KeyboardInterrupt):
+            # What has ended, or was given back, stays as it is
+            with undisturbed():
+                for claim in claims:
+                    ledger.release(claim)
             raise
         if not ledger.left():
             forget_ended(ledger, logs)
