@@ -120,7 +120,6 @@ def test_a_process_that_tunes_imports_the_package(package, tmp_path, monkeypatch
     (tmp_path / "base.yml").write_text(yaml.safe_dump({SLASH: {"policy": "MlpPolicy", "n_timesteps": 40}}))
     common = ["--algo", "td3", "--trials", "1", "--seeds", "1", "--eval-episodes", "1", "--device", "cpu", "--set", *TINY]
     common += ["--conf-file", str(tmp_path / "base.yml"), "--logs", str(tmp_path), "--parent", str(os.getppid())]
-    monkeypatch.setattr("signal.signal", lambda *args: None)
     for number, argv in enumerate((["--env", f"{package}:{SLASH}"], ["--env", SLASH, "--gym-packages", package])):
         forget()
         storage = InMemoryStorage()

@@ -111,7 +111,6 @@ def test_the_command_says_how_a_tuning_ended(tmp_path, monkeypatch, capsys, pret
     """... when its processes, which this one stands for, have ended."""
     storage, left = InMemoryStorage(), iter(scores)
     monkeypatch.setattr(tune, "open_storage", lambda url: storage)
-    monkeypatch.setattr("signal.signal", lambda *args: None)
 
     def score(run):
         value = next(left)
