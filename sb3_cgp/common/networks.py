@@ -69,8 +69,12 @@ def evaluation_mode(network: nn.Module) -> Iterator[None]:
 
     Neither dropout nor batch statistics disturb it then, and its running statistics do not change.
 
-    :param network: the network. A submodule that alone was in training mode is left in evaluation mode.
+    :param network: the network. One without modes is left as it is. A submodule that alone was in training mode is left in
+        evaluation mode.
     """
+    if not has_modes(network):
+        yield
+        return
     was_training = network.training
     set_mode(network, False)
     try:
