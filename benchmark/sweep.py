@@ -34,7 +34,7 @@ examples:
   python -m benchmark.sweep e4 --task Pendulum-v1 --steps 3000 --seeds 1 --set "policy_kwargs=dict(net_arch=[64, 64])"
   python -m benchmark.sweep mine.yml --workers 2"""
 DURATION = """\
-The first example takes ten minutes on two cores. With a million steps on HalfCheetah-v5, a run of CGP takes 12 hours on a
+The first example takes ten minutes on two cores. With a million steps on HalfCheetah-v5, a run of CGP takes 6 to 12 hours on a
 core of an AMD EPYC, and one of TD3 about two hours; e1 is 200 runs. --steps shortens runs; at most a tenth of a shortened run
 is random, unless --set learning_starts=... sets the number. After an interruption, the same command continues."""
 RESULTS = """\
