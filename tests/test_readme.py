@@ -27,7 +27,7 @@ def test_every_file_that_the_readme_links_to_exists():
 @pytest.mark.parametrize(
     ("row", "record", "methods"),
     [
-        ("minutes for 100,000 steps, one CPU thread", "runtime_light", ["TD3", "CGP-Light", "CGP-2"]),
+        ("minutes for 100,000 steps, one CPU thread", "runtime_light_zen5", ["TD3", "CGP-Light", "CGP-2"]),
         ("[the same on an NVIDIA H100](docs/speed.md#on-a-gpu)", "runtime_gpu", ["TD3", None, "CGP-2"]),
     ],
 )
