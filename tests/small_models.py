@@ -3,7 +3,7 @@
 import pytest
 import torch as th
 
-from sb3_cgp import CGP
+from sb3_cgp import CEM, CGP, MlpPolicy
 
 VARIANTS = {
     "CGP-Online": dict(),
@@ -13,6 +13,13 @@ VARIANTS = {
     "CEM": dict(policy_loss=None),
     "CGP-Light": dict(cem_start="actor", cem_iterations=1),
 }
+
+
+class WithSelector(MlpPolicy):
+    """A policy class of a user's, with a selector of its own."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **(dict(selector=CEM(1, 8, 4)) | kwargs))
 
 
 def make_model(env="Pendulum-v1", policy="MlpPolicy", **kwargs):
